@@ -57,7 +57,7 @@ def test_ages_are_those_of_the_campaign_s_link(name: str) -> None:
         # Runs are independent: five standard deviations of a share, of one run at least where there is chance in it.
         spread = max(expected * (1.0 - expected), 1.0 / RUNS) if 1e-12 < expected < 1.0 - 1e-12 else 0.0
         assert abs(share - expected) <= 5.0 * np.sqrt(spread / RUNS) + 1e-9, steps
-    assert build_conditioned(given, for_flight=False).solver.risk.beyond == model.outage(60)
+    assert build_conditioned(given, for_flight=False).solver.risk.older_probability == model.outage(60)
 
 
 @pytest.mark.parametrize("loss", [0.3, 0.8])

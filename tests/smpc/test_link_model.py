@@ -64,20 +64,20 @@ def test_independent_losses_have_the_closed_form_at_every_age_of_the_base() -> N
     assert [link.outage(n) for n in range(5)] == pytest.approx([q**n for n in range(5)])
 
 
-def test_a_loss_that_cannot_be_leaves_the_link_as_it_was() -> None:
+def test_a_loss_of_probability_zero_changes_no_link_state() -> None:
     assert bernoulli(np.array([1.0])).availability(5, 1, late=3) == 1.0
     # A run of two at most, and three are seen: the next position comes as after an arrival.
     assert empirical(np.array([0.5, 0.2, 0.3])).availability(4, 3, late=3) == pytest.approx(0.5)
 
 
-def test_varying_probabilities_go_by_their_step_and_the_last_one_is_repeated() -> None:
+def test_varying_probabilities_follow_their_step_and_the_last_is_repeated() -> None:
     p = np.array([0.9, 0.2, 0.7, 0.5])
     link = bernoulli(p)
-    every = np.concatenate([p, np.full(T, 0.5)])
+    all_values = np.concatenate([p, np.full(T, 0.5)])
     for late, t, delay in product(range(4), range(1, T), range(1, 5)):
         if t >= delay and t > late:
             first = max(t - delay + 1, late + 1)
-            expected = 1.0 - np.prod(1.0 - every[first - 1 : t])
+            expected = 1.0 - np.prod(1.0 - all_values[first - 1 : t])
             assert link.availability(t, t - delay, late) == pytest.approx(expected)
 
 
@@ -123,8 +123,8 @@ def test_runs_by_hand() -> None:
     assert 1.0 - link.outage(1) == pytest.approx(1.0 / 1.95)
 
 
-def test_late_positions_have_the_product_form_of_what_is_under_way() -> None:
-    beyond = np.concatenate([[1.0], TAIL, np.full(20, TAIL[-1])])  # P(D > i - 1)
+def test_late_positions_have_the_product_form() -> None:
+    outside = np.concatenate([[1.0], TAIL, np.full(20, TAIL[-1])])  # P(D > i - 1)
     link = LatePackets(TAIL)
     for late, t, delay in product(range(5), range(T), range(1, 6)):
         if t - delay < 0 or t <= late:
@@ -133,11 +133,11 @@ def test_late_positions_have_the_product_form_of_what_is_under_way() -> None:
         missing = 1.0
         for i in range(min(delay, t)):
             waited = late - (t - i)
-            missing *= beyond[i + 1] / (beyond[waited + 1] if waited >= 0 else 1.0)
+            missing *= outside[i + 1] / (outside[waited + 1] if waited >= 0 else 1.0)
         assert link.availability(t, t - delay, late) == pytest.approx(1.0 - missing, abs=1e-14)
 
 
-def test_a_position_is_lost_or_here_if_the_tail_is_flat() -> None:
+def test_a_flat_tail_is_a_link_of_independent_losses() -> None:
     flat = LatePackets(np.array([0.3]))
     np.testing.assert_allclose(flat.age(T), LINKS["bernoulli"].age(T), atol=1e-15)
     for late in range(4):
@@ -221,14 +221,14 @@ def test_counted_ages_after_bursts_follow_the_distribution(shape: tuple[int, int
 def test_each_stage_alone_is_at_least_as_likely_as_all_together(name: str) -> None:
     link, delays = LINKS[name], [2, 3, 3, 2, 4, 3, 3, 2, 3, 3]
     joint = link.joint_availability(delays)
-    alone = [link.availability(t, t - d) for t, d in enumerate(delays)]
+    single = [link.availability(t, t - d) for t, d in enumerate(delays)]
     assert np.all(np.diff(joint) <= 1e-15)
-    assert np.all(joint <= np.minimum.accumulate(alone) + 1e-12)
+    assert np.all(joint <= np.minimum.accumulate(single) + 1e-12)
 
 
 @given(PROBABILITY, PROBABILITY, st.integers(1, 6), st.integers(0, 4))
-def test_more_loss_never_makes_news_likelier(p: float, other: float, delay: int, late: int) -> None:
-    worse, better = (bernoulli(np.array([one])) for one in sorted((p, other)))
+def test_more_loss_never_raises_availability(p: float, other: float, delay: int, late: int) -> None:
+    worse, better = (bernoulli(np.array([item])) for item in sorted((p, other)))
     for t in range(T):
         assert better.availability(t, t - delay, late) >= worse.availability(t, t - delay, late) - 1e-12
     assert np.all(better.joint_availability([delay] * T) >= worse.joint_availability([delay] * T) - 1e-12)
@@ -241,12 +241,12 @@ def test_more_loss_in_the_bad_state_makes_outages_more_frequent(
 ) -> None:
     # In the long run only: an arrival over a link that loses all in its bad state tells that the state is good.
     low, high = sorted((loss, other))
-    worse, better = (gilbert_elliott(enter=enter, leave=leave, good_loss=0.0, bad_loss=one) for one in (high, low))
+    worse, better = (gilbert_elliott(enter=enter, leave=leave, good_loss=0.0, bad_loss=item) for item in (high, low))
     assert better.outage(steps) <= worse.outage(steps) + 1e-9
 
 
 @given(st.floats(0.0, 0.5), st.floats(0.0, 0.5), st.floats(0.05, 0.5), st.floats(0.05, 0.5), st.integers(1, 6))
-def test_bursts_more_often_or_longer_never_make_news_likelier(
+def test_more_or_longer_bursts_never_raise_availability(
     enter: float, other_enter: float, leave: float, other_leave: float, delay: int
 ) -> None:
     (rare, often), (long, short) = sorted((enter, other_enter)), sorted((leave, other_leave))
@@ -261,7 +261,7 @@ def test_bursts_more_often_or_longer_never_make_news_likelier(
 
 
 @given(st.lists(PROBABILITY, min_size=1, max_size=5), st.integers(0, 4), st.integers(1, 6), st.integers(0, T))
-def test_an_older_base_never_makes_news_likelier(p: list[float], late: int, delay: int, t: int) -> None:
+def test_an_older_base_never_raises_availability(p: list[float], late: int, delay: int, t: int) -> None:
     link = bernoulli(np.array(p))
     assert link.availability(t, t - delay, late + 1) <= link.availability(t, t - delay, late) + 1e-12
 
@@ -290,7 +290,7 @@ def test_any_measured_runs_make_a_distribution(runs: list[float], packets: int) 
         (lambda: gilbert_elliott(enter=0.1, leave=0.1, good_loss=1, bad_loss=1), r"link\.model: no packet ever"),
     ],
 )
-def test_a_link_that_cannot_be_is_refused(make: object, message: str) -> None:
+def test_an_impossible_link_is_refused(make: object, message: str) -> None:
     assert callable(make)
     with pytest.raises(DesignError, match=message):
         make()

@@ -1,4 +1,4 @@
-"""The bound of the unlimited problem: closed forms, least squares, and what simulations cost."""
+"""The cost bound without limits: closed forms, least squares, and simulated costs."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ STEPS = 50
 
 def growing(factor: float) -> Plant:
     """One state that grows by a factor a step, as position and as velocity."""
-    one = np.ones((1, 1))
+    item = np.ones((1, 1))
     return Plant(
-        a=factor * one,
-        b=one,
-        e=one,
-        w=0.5 * one,
+        a=factor * item,
+        b=item,
+        e=item,
+        w=0.5 * item,
         dt_s=1.0,
         axes=("north",),
         position_index=(0,),
@@ -37,7 +37,7 @@ def growing(factor: float) -> Plant:
 
 
 def prices(plant: Plant, q_x: Array, q_u: Array) -> tuple[float, Array, Array]:
-    """What is paid for a state that is known, the price M of not knowing it, and E W E'."""
+    """Return the cost of a known state, the weight M of its error, and E W E'."""
     best = lqr(plant, q_x, q_u)
     spread = plant.e @ plant.w @ plant.e.T
     price = plant.a.T @ best.p @ plant.a + q_x - best.p  # = A'PB (R + B'PB)^-1 B'PA, by Riccati's equation
@@ -47,16 +47,16 @@ def prices(plant: Plant, q_x: Array, q_u: Array) -> tuple[float, Array, Array]:
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.7, 0.9])
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_independent_losses_are_a_lyapunov_equation(name: str, loss: float) -> None:
-    given = problem(name)
-    known, price, spread = prices(given.plant, given.q_x, given.q_u)
-    error = loss * solve_discrete_lyapunov(np.sqrt(loss) * given.plant.a, spread)
-    bound = stationary_bound(given.plant, given.q_x, given.q_u, bernoulli(np.array([1.0 - loss])))
+    case = problem(name)
+    known, price, spread = prices(case.plant, case.q_x, case.q_u)
+    error = loss * solve_discrete_lyapunov(np.sqrt(loss) * case.plant.a, spread)
+    bound = stationary_bound(case.plant, case.q_x, case.q_u, bernoulli(np.array([1.0 - loss])))
     assert bound == pytest.approx(known + float(np.sum(price * error)), rel=1e-9)
 
 
 def test_the_paper_s_example_costs_at_least_10_67_an_axis() -> None:
-    given = problem("paper")
-    bound = stationary_bound(given.plant, given.q_x, given.q_u, bernoulli(np.array([0.7])))
+    case = problem("paper")
+    bound = stationary_bound(case.plant, case.q_x, case.q_u, bernoulli(np.array([0.7])))
     assert bound / 2 == pytest.approx(10.6666, abs=5e-5)
 
 
@@ -71,26 +71,26 @@ def test_the_paper_s_example_costs_at_least_10_67_an_axis() -> None:
 )
 def test_other_links_count_by_their_stationary_age(link: LinkModel) -> None:
     """The mean over the ages, j of P(a = j) Σ_{i<j} A^i N A'^i, from the chain of the age itself."""
-    given = problem("paper")
-    known, price, spread = prices(given.plant, given.q_x, given.q_u)
+    case = problem("paper")
+    known, price, spread = prices(case.plant, case.q_x, case.q_u)
     ages = link.age(300)[-1]
     error, grown, mean = np.zeros_like(spread), spread, np.zeros_like(spread)
     for share in ages:
         mean = mean + share * error
-        error, grown = error + grown, given.plant.a @ grown @ given.plant.a.T
-    bound = stationary_bound(given.plant, given.q_x, given.q_u, link)
+        error, grown = error + grown, case.plant.a @ grown @ case.plant.a.T
+    bound = stationary_bound(case.plant, case.q_x, case.q_u, link)
     assert bound == pytest.approx(known + float(np.sum(price * mean)), rel=1e-9)
 
 
 def test_lqg_without_limits_costs_the_bound_and_would_break_them_in_7_percent_of_steps() -> None:
-    given, runs, steps, burn = problem("paper"), 600, 220, 20
-    free = unlimited(given)
-    result = flown(free, Lqg(free), np.zeros(4), arrivals(runs, steps, 0.3, 1), noise(given, runs, steps, 2))
+    case, runs, steps, burn = problem("paper"), 600, 220, 20
+    free = unlimited(case)
+    result = flown(free, Lqg(free), np.zeros(4), arrivals(runs, steps, 0.3, 1), noise(case, runs, steps, 2))
     mean = result.cost[:, burn:].mean(axis=1)
-    bound = stationary_bound(given.plant, given.q_x, given.q_u, bernoulli(np.array([0.7])))
+    bound = stationary_bound(case.plant, case.q_x, case.q_u, bernoulli(np.array([0.7])))
     assert abs(mean.mean() - bound) < 3.0 * mean.std() / np.sqrt(runs)
-    beyond = np.abs(result.requested[:, burn:]) > 7.5  # of each axis by itself
-    assert beyond.mean() == pytest.approx(0.075, abs=0.004)
+    outside = np.abs(result.requested[:, burn:]) > 7.5  # of each axis by itself
+    assert outside.mean() == pytest.approx(0.075, abs=0.004)
 
 
 def test_no_bound_where_the_error_grows_faster_than_losses_end() -> None:
@@ -158,21 +158,21 @@ def _errors(plant: Plant, noise: Array, ages: Array) -> Array:
 
 
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg", "coupled 0"])
-def test_without_any_news_the_finite_bound_is_a_least_squares_plan_and_the_open_loop_s_spread(name: str) -> None:
-    given, steps = problem(name), 9
-    plant = given.plant
-    x0 = given.target + np.random.default_rng(3).normal(size=plant.n_x)
+def test_without_positions_the_finite_bound_is_least_squares_and_open_loop_covariance(name: str) -> None:
+    case, steps = problem(name), 9
+    plant = case.plant
+    x0 = case.target + np.random.default_rng(3).normal(size=plant.n_x)
     ages = np.eye(steps)  # a(k) = k
     of_x, of_u = stacked(plant, steps)
-    root_x, root_u = np.linalg.cholesky(given.q_x).T, np.linalg.cholesky(given.q_u).T
+    root_x, root_u = np.linalg.cholesky(case.q_x).T, np.linalg.cholesky(case.q_u).T
     matrix = np.vstack([root_x @ each for each in of_u] + [np.kron(np.eye(steps), root_u)])
-    drift = np.concatenate([root_x @ each @ (x0 - given.target) for each in of_x] + [np.zeros(steps * plant.n_u)])
+    drift = np.concatenate([root_x @ each @ (x0 - case.target) for each in of_x] + [np.zeros(steps * plant.n_u)])
     plan = np.linalg.lstsq(matrix, -drift, rcond=None)[0]
     cost, spread = float(np.sum((matrix @ plan + drift) ** 2)), np.zeros_like(plant.a)
     for _ in range(steps):
-        cost += float(np.sum(given.q_x * spread))
+        cost += float(np.sum(case.q_x * spread))
         spread = plant.a @ spread @ plant.a.T + plant.e @ plant.w @ plant.e.T
-    bound = finite_bound(plant, given.q_x, given.q_u, x0, given.target, given.u_target, ages)
+    bound = finite_bound(plant, case.q_x, case.q_u, x0, case.target, case.u_target, ages)
     assert bound == pytest.approx(cost, rel=1e-9)
 
 
@@ -206,24 +206,24 @@ def test_the_best_law_of_a_finite_flight_costs_the_finite_bound(loss: float) -> 
 
 
 def test_one_step_more_of_a_long_flight_costs_the_stationary_bound() -> None:
-    given, link = problem("paper"), bernoulli(np.array([0.7]))
+    case, link = problem("paper"), bernoulli(np.array([0.7]))
     ages = link.age(120)
     longer, shorter = (
-        finite_bound(given.plant, given.q_x, given.q_u, PAPER_START, given.target, given.u_target, ages[:steps])
+        finite_bound(case.plant, case.q_x, case.q_u, PAPER_START, case.target, case.u_target, ages[:steps])
         for steps in (121, 120)
     )
-    bound = stationary_bound(given.plant, given.q_x, given.q_u, link)
+    bound = stationary_bound(case.plant, case.q_x, case.q_u, link)
     assert longer - shorter == pytest.approx(bound, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize("loss", [0.3, 0.6])
-def test_nobody_beats_the_bound(name: str, loss: float) -> None:
-    given, runs = unlimited(problem("paper")), 300
-    newest, disturbances = arrivals(runs, STEPS, loss, 5), noise(given, runs, STEPS, 6)
-    cost = flown(given, MAKERS[name](given), PAPER_START, newest, disturbances).cost.sum(axis=1)
+def test_no_controller_beats_the_bound(name: str, loss: float) -> None:
+    case, runs = unlimited(problem("paper")), 300
+    newest, disturbances = arrivals(runs, STEPS, loss, 5), noise(case, runs, STEPS, 6)
+    cost = flown(case, MAKERS[name](case), PAPER_START, newest, disturbances).cost.sum(axis=1)
     ages = bernoulli(np.array([1.0 - loss])).age(STEPS - 1)
-    bound = finite_bound(given.plant, given.q_x, given.q_u, PAPER_START, given.target, given.u_target, ages)
+    bound = finite_bound(case.plant, case.q_x, case.q_u, PAPER_START, case.target, case.u_target, ages)
     assert cost.mean() > bound - 3.0 * cost.std() / np.sqrt(runs)
     if name in ("lqg", "packetised"):  # both are the best there is, but for the end of the flight
         assert cost.mean() < bound * 1.01 + 3.0 * cost.std() / np.sqrt(runs)

@@ -1,4 +1,4 @@
-"""A controller of another package as a solver: what it is told, what of its answer flies, and what is refused."""
+"""A controller of another package as a solver: its request, its answer, and faults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uavctl.smpc.outside import OutsideSolver, PlanRequest, SilencePlanner, reta
 
 
 class Saying:
-    """Answers as it is told to, and keeps what it was asked."""
+    """Returns given answers, and keeps its requests."""
 
     def __init__(self, say: Callable[[PlanRequest], Any]) -> None:
         self.say, self.asked = say, list[PlanRequest]()
@@ -38,7 +38,7 @@ def here(paper: ControlProblem) -> Array:
     return paper.target + np.linspace(0.5, 1.0, paper.plant.n_x)
 
 
-def test_it_is_told_all_that_a_scheme_is_and_can_change_nothing_of_it(paper: ControlProblem) -> None:
+def test_a_request_has_all_data_of_a_scheme_and_is_read_only(paper: ControlProblem) -> None:
     saying = Saying(lambda request: request.inputs)
     solver, n_x, n_u, steps = OutsideSolver("ours", paper, saying), paper.plant.n_x, paper.plant.n_u, paper.horizon
     rng = np.random.default_rng(1)
@@ -46,38 +46,43 @@ def test_it_is_told_all_that_a_scheme_is_and_can_change_nothing_of_it(paper: Con
     limits = rng.normal(size=(steps + 1, paper.state_set.b.size))
     cov, sent, x = np.eye(n_x), rng.normal(size=n_u), here(paper)
     answer = solver.solve(7, x, paper.target, Preview(limits=limits, path=path, age=3, cov=cov, sent=sent))
-    (told,) = saying.asked
-    assert (told.step, told.age) == (7, 3)
-    np.testing.assert_array_equal(told.state, x)
-    np.testing.assert_array_equal(told.states, paper.target + path.states)
-    np.testing.assert_allclose(told.inputs, paper.u_target + path.inputs, atol=1e-12)
-    for given, want in ((told.limits, limits), (told.cov, cov), (told.sent, sent), (told.target, paper.target)):
-        assert given is not None
-        np.testing.assert_array_equal(given, want)
+    (reported,) = saying.asked
+    assert (reported.step, reported.age) == (7, 3)
+    np.testing.assert_array_equal(reported.state, x)
+    np.testing.assert_array_equal(reported.states, paper.target + path.states)
+    np.testing.assert_allclose(reported.inputs, paper.u_target + path.inputs, atol=1e-12)
+    for case, want in (
+        (reported.limits, limits),
+        (reported.cov, cov),
+        (reported.sent, sent),
+        (reported.target, paper.target),
+    ):
+        assert case is not None
+        np.testing.assert_array_equal(case, want)
         with pytest.raises(ValueError, match="read-only"):
-            given[0] = 1.0
-    np.testing.assert_allclose(answer.inputs, told.inputs, atol=1e-12)
+            case[0] = 1.0
+    np.testing.assert_allclose(answer.inputs, reported.inputs, atol=1e-12)
 
 
-def test_its_plan_is_cut_to_the_limits_and_predicted_by_the_plant(paper: ControlProblem) -> None:
+def test_a_plan_is_clipped_to_the_limits_and_predicted_by_the_plant(paper: ControlProblem) -> None:
     low, high = paper.input_set.bounds
-    wanted = np.linspace(3.0 * low, 2.0 * high, paper.horizon)
+    expected = np.linspace(3.0 * low, 2.0 * high, paper.horizon)
     x = here(paper)
-    answer = OutsideSolver("ours", paper, Saying(lambda _: wanted)).solve(1, x, paper.target)
+    answer = OutsideSolver("ours", paper, Saying(lambda _: expected)).solve(1, x, paper.target)
     assert answer.status is SolveStatus.OPTIMAL and answer.seq == 1 and answer.method == "ours"
-    np.testing.assert_array_equal(answer.inputs, np.clip(wanted, low, high))
+    np.testing.assert_array_equal(answer.inputs, np.clip(expected, low, high))
     for now, u, after in zip(answer.states, answer.inputs, answer.states[1:], strict=False):
         np.testing.assert_allclose(after, paper.plant.a @ now + paper.plant.b @ u, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(answer.states[0], x)
 
 
-def test_behind_one_input_the_regulator_of_the_costs_plays_on(paper: ControlProblem) -> None:
+def test_after_one_input_the_regulator_continues(paper: ControlProblem) -> None:
     x, first = here(paper), 0.3 * paper.input_set.bounds[1]
     answer = OutsideSolver("ours", paper, Saying(lambda _: first)).solve(1, x, paper.target)
     np.testing.assert_array_equal(answer.inputs[0], first)
     gain = lqr(paper.plant, paper.q_x, paper.q_u).k
-    wanted = paper.u_target + (answer.states[1:-1] - paper.target) @ gain.T
-    np.testing.assert_allclose(answer.inputs[1:], np.clip(wanted, *paper.input_set.bounds), atol=1e-9)
+    expected = paper.u_target + (answer.states[1:-1] - paper.target) @ gain.T
+    np.testing.assert_allclose(answer.inputs[1:], np.clip(expected, *paper.input_set.bounds), atol=1e-9)
 
 
 def fail(_: PlanRequest) -> None:
@@ -102,7 +107,7 @@ class Worse:
 
 
 @pytest.mark.parametrize(
-    ("say", "told"),
+    ("say", "reported"),
     [
         (fail, "raised KeyError"),
         (lambda r: r.inputs * np.nan, "not finite"),
@@ -122,22 +127,22 @@ class Worse:
         (raising(ValueError("two\nlines \x1b[31m")), "raised ValueError: two lines  [31m ("),
     ],
 )
-def test_what_cannot_be_flown_is_a_fault_that_names_it(
-    paper: ControlProblem, say: Callable[[PlanRequest], Any], told: str
+def test_an_answer_that_cannot_be_flown_is_a_fault(
+    paper: ControlProblem, say: Callable[[PlanRequest], Any], reported: str
 ) -> None:
     answer = OutsideSolver("ours", paper, Saying(say)).solve(1, here(paper), paper.target)
     assert answer.status is SolveStatus.FAILED and answer.inputs.size == 0
     assert answer.fault.startswith("the controller ours ") and len(answer.fault) < 300
-    assert any(words in answer.fault for words in told.split("|"))
+    assert any(words in answer.fault for words in reported.split("|"))
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), EndedBySignal(130)])
-def test_what_an_operator_ends_ends(paper: ControlProblem, error: BaseException) -> None:
+def test_an_interrupt_passes_the_solver(paper: ControlProblem, error: BaseException) -> None:
     with pytest.raises(type(error)):
         OutsideSolver("ours", paper, Saying(raising(error))).solve(1, here(paper), paper.target)
 
 
-def test_how_it_takes_overflows_stays_with_it(paper: ControlProblem) -> None:
+def test_numpy_error_settings_of_a_controller_stay_its_own(paper: ControlProblem) -> None:
     def strict(request: PlanRequest) -> Array:
         np.seterr(all="raise")
         return request.inputs
@@ -147,7 +152,7 @@ def test_how_it_takes_overflows_stays_with_it(paper: ControlProblem) -> None:
     assert np.geterr() == before
 
 
-def test_where_it_raised_is_told(paper: ControlProblem) -> None:
+def test_a_fault_names_file_and_line_of_the_error(paper: ControlProblem) -> None:
     answer = OutsideSolver("ours", paper, Saying(fail)).solve(1, here(paper), paper.target)
     line = fail.__code__.co_firstlineno + 1
     assert answer.fault.endswith(f"(test_outside_solver.py, line {line})")
@@ -167,7 +172,7 @@ class Shrinking:
         return self.gain[:, None] * np.ones((1, self.problem.plant.n_u))
 
 
-def test_a_campaign_s_controller_is_asked_for_each_step_of_silence_and_forgets_that(paper: ControlProblem) -> None:
+def test_a_campaign_controller_plans_silence_without_a_change_of_its_state(paper: ControlProblem) -> None:
     solver = OutsideSolver("ours", paper, SilencePlanner(lambda target: (retarget(paper, target), Shrinking(paper))))
     halves = 0.5 ** np.arange(1, paper.horizon + 2)
     for seq in range(2):  # asked twice: the first input of each plan is what it has really done

@@ -1,4 +1,4 @@
-"""Plant and sets: closed forms, the semigroup of sub-steps, and what is refused."""
+"""Plant and sets: closed forms, the semigroup of sub-steps, and refusals."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_drag_lag_where_partial_fractions_break_down(drag: float) -> None:
     assert np.isfinite(plant.transition(DT / 3)[0]).all()
 
 
-def test_axes_of_a_drag_lag_plant_do_not_touch() -> None:
+def test_axes_of_a_drag_lag_plant_are_independent() -> None:
     plant = room_plant()
     assert (plant.n_x, plant.n_u, plant.n_w) == (9, 3, 3)
     assert plant.position_index == (0, 3, 6)
@@ -84,14 +84,14 @@ def test_part_of_a_step_of_the_printed_plant_is_a_first_order_lag(share: float) 
 
 def test_part_of_a_drag_lag_step_is_the_plant_of_that_step() -> None:
     whole, part = lagged(), lagged(dt_s=0.07)
-    for ours, theirs in zip(whole.transition(0.07), (part.a, part.b, part.e), strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    for result, reference in zip(whole.transition(0.07), (part.a, part.b, part.e), strict=True):
+        np.testing.assert_allclose(result, reference, atol=1e-12)
 
 
 def test_whole_step_gives_the_matrices_bit_for_bit() -> None:
     plant = paper_plant()
-    for ours, theirs in zip(plant.transition(plant.dt_s), (plant.a, plant.b, plant.e), strict=True):
-        assert np.array_equal(ours, theirs)
+    for result, reference in zip(plant.transition(plant.dt_s), (plant.a, plant.b, plant.e), strict=True):
+        assert np.array_equal(result, reference)
 
 
 @given(first=st.floats(0.01, 0.99), share=st.floats(0.01, 0.99))
@@ -221,7 +221,7 @@ def test_a_state_that_no_input_moves_is_refused() -> None:
         ({"accel_per_input": np.ones(2)}, r"plant\.accel_per_input: shape \(2,\) is not \(1,\)"),
     ],
 )
-def test_a_plant_that_is_none_is_refused(changes: dict[str, Any], message: str) -> None:
+def test_an_invalid_plant_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(DesignError, match=message):
         replace(one_axis(paper_plant()), **changes)
 
@@ -276,7 +276,7 @@ def test_box_without_limits_has_no_rows() -> None:
     assert box.margin(np.zeros(2)).shape == (0,)
 
 
-def test_what_states_are_called_makes_no_other_design() -> None:
+def test_names_of_states_do_not_change_the_digest() -> None:
     plant = drag_lag([0.3], [0.2], [1.0], [0.1], 0.2, ("north",))
     assert digest(replace(plant, extra_states=(("something", "m"),))) == digest(plant)
     assert digest(replace(plant, dt_s=0.2000001)) != digest(plant)

@@ -1,4 +1,4 @@
-"""The quadratic programs against CVXPY, and their bits."""
+"""Quadratic programs against CVXPY, and their bits."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ class Drawn:
 
     def cost(self, z: Array) -> float:
         value = self.a @ z
-        beyond = np.maximum(np.maximum(value - self.upper, self.lower - value), 0.0)
-        return float(0.5 * z @ self.h @ z + self.f @ z + self.price @ beyond + self.curve @ beyond**2)
+        outside = np.maximum(np.maximum(value - self.upper, self.lower - value), 0.0)
+        return float(0.5 * z @ self.h @ z + self.f @ z + self.price @ outside + self.curve @ outside**2)
 
     def optimum(self) -> float:
-        z, beyond = cp.Variable(self.f.size), cp.Variable(len(self.a), nonneg=True)
-        cost = 0.5 * cp.sum_squares(np.linalg.cholesky(self.h).T @ z) + self.f @ z + self.price @ beyond
-        cost += self.curve @ cp.square(beyond)
+        z, outside = cp.Variable(self.f.size), cp.Variable(len(self.a), nonneg=True)
+        cost = 0.5 * cp.sum_squares(np.linalg.cholesky(self.h).T @ z) + self.f @ z + self.price @ outside
+        cost += self.curve @ cp.square(outside)
         above, below = np.flatnonzero(self.upper < OPEN), np.flatnonzero(self.lower > -OPEN)
-        rows = [(self.a @ z - beyond)[above] <= self.upper[above], (self.a @ z + beyond)[below] >= self.lower[below]]
-        rows.append(beyond[np.flatnonzero(self.sense != SOFT)] == 0.0)
+        rows = [(self.a @ z - outside)[above] <= self.upper[above], (self.a @ z + outside)[below] >= self.lower[below]]
+        rows.append(outside[np.flatnonzero(self.sense != SOFT)] == 0.0)
         problem = cp.Problem(cp.Minimize(cost), rows)
         problem.solve(solver=cp.CLARABEL)
         assert problem.status == cp.OPTIMAL
@@ -83,12 +83,12 @@ def test_multipliers_are_those_of_the_optimum(seed: int) -> None:
     assert np.all(np.abs(over[hard & (net > 1e-7)]) < 1e-7)
     assert np.all(np.abs(under[hard & (net < -1e-7)]) < 1e-7)
     soft = drawn.sense == SOFT
-    beyond = np.maximum(np.maximum(over, under), 0.0)
+    outside = np.maximum(np.maximum(over, under), 0.0)
     # The program that is solved gives every soft row a least curve.
     curve = np.maximum(drawn.curve, LEAST_CURVE * np.abs(np.diagonal(drawn.h)).max(initial=1.0))
-    slope = drawn.price + 2.0 * curve * beyond
+    slope = drawn.price + 2.0 * curve * outside
     assert np.all(np.abs(net)[soft] <= slope[soft] + 1e-6)
-    left = soft & (beyond > 1e-6)
+    left = soft & (outside > 1e-6)
     assert np.abs(net)[left] == pytest.approx(slope[left], rel=1e-5, abs=1e-6)
     inside = soft & (over < -1e-6) & (under < -1e-6)
     assert np.abs(net)[inside] == pytest.approx(np.zeros(inside.sum()), abs=1e-8)
@@ -113,7 +113,7 @@ def test_one_variable_by_hand() -> None:
     assert (solved[0][0], solved[1][0]) == pytest.approx((3.5, 3.0), abs=1e-9)
 
 
-def test_no_optimum_no_answer() -> None:
+def test_without_an_optimum_there_is_no_answer() -> None:
     program = QuadraticProgram(np.eye(1), np.ones((2, 1)), np.zeros(2, dtype=np.int32), np.zeros(2), np.zeros(2))
     sides = np.array([1.0, 5.0]), np.array([-OPEN, 3.0])  # z <= 1 and z >= 3
     assert program.solve(np.zeros(1), *sides) is None
@@ -125,10 +125,10 @@ def test_no_optimum_no_answer() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_same_question_same_bits_whatever_came_before(seed: int) -> None:
+def test_same_question_same_bits_after_any_other_questions(seed: int) -> None:
     drawn = Drawn(seed)
-    fresh = drawn.program().solve(drawn.f, drawn.upper, drawn.lower)
-    assert fresh is not None
+    new = drawn.program().solve(drawn.f, drawn.upper, drawn.lower)
+    assert new is not None
     used, rng = drawn.program(), np.random.default_rng(seed)
     for _ in range(100):
         shift = rng.normal(size=drawn.upper.size)
@@ -137,10 +137,10 @@ def test_same_question_same_bits_whatever_came_before(seed: int) -> None:
     used.solve(drawn.f, drawn.lower, drawn.upper)
     again = used.solve(drawn.f, drawn.upper, drawn.lower)
     assert again is not None
-    assert [part.tobytes() for part in again] == [part.tobytes() for part in fresh]
-    anew = used.solve_with_matrices(drawn.h, drawn.f, drawn.a, drawn.upper, drawn.lower)
-    assert anew is not None
-    assert [part.tobytes() for part in anew] == [part.tobytes() for part in fresh]
+    assert [part.tobytes() for part in again] == [part.tobytes() for part in new]
+    repeated = used.solve_with_matrices(drawn.h, drawn.f, drawn.a, drawn.upper, drawn.lower)
+    assert repeated is not None
+    assert [part.tobytes() for part in repeated] == [part.tobytes() for part in new]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -162,9 +162,9 @@ def test_new_matrices_are_a_new_program() -> None:
     other = Drawn(8)
     other.h, other.a = other.h + np.eye(other.f.size), other.a * rng.uniform(0.9, 1.1, (len(other.a), 1))
     other.upper[0] = other.lower[0] = 0.0
-    anew = used.solve_with_matrices(other.h, other.f, other.a, other.upper, other.lower)
-    assert anew is not None
-    assert other.cost(anew[0]) == pytest.approx(other.optimum(), rel=1e-6)
-    fresh = other.program().solve(other.f, other.upper, other.lower)
-    assert fresh is not None
-    assert anew[0].tobytes() == fresh[0].tobytes()
+    repeated = used.solve_with_matrices(other.h, other.f, other.a, other.upper, other.lower)
+    assert repeated is not None
+    assert other.cost(repeated[0]) == pytest.approx(other.optimum(), rel=1e-6)
+    new = other.program().solve(other.f, other.upper, other.lower)
+    assert new is not None
+    assert repeated[0].tobytes() == new[0].tobytes()

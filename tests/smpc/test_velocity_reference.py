@@ -1,4 +1,4 @@
-"""The plant of an autopilot that holds a velocity: its equations, the simulated autopilot, and what is refused."""
+"""The plant of an autopilot that holds a velocity: its equations, the simulated autopilot, and refusals."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def loops(axis: VelocityReferenceAxis, u: float, wind: float, gains: float) -> A
     def slope(_t: float, y: Array) -> list[float]:
         p, v, b, position, velocity, j, f = y.tolist()
         error = velocity - v + axis.position_1ps * (position - p)
-        wanted = u + axis.velocity_1ps * error + j
+        expected = u + axis.velocity_1ps * error + j
         return [
             v,
             b + f - axis.drag_1ps * v + wind,
-            (wanted - b) / axis.lag_s,
+            (expected - b) / axis.lag_s,
             velocity,
             u,
             axis.integral_1ps2 * error,
@@ -77,7 +77,7 @@ def loops(axis: VelocityReferenceAxis, u: float, wind: float, gains: float) -> A
     return slope
 
 
-def seen(y: Array) -> Array:
+def observed(y: Array) -> Array:
     """States of the plant of a state (p, v, b, P, V, j, f) of the loops."""
     p, v, b, position, velocity, j, f = y
     return np.array([p, v, b + f, position - p, velocity - v, j + f])
@@ -98,14 +98,14 @@ def test_a_step_is_that_of_the_loops_integrated(
     plant = velocity_reference([axis], DT, ("north",))
     end = solve_ivp(loops(axis, u, wind, gains), (0.0, DT), start, rtol=1e-11, atol=1e-12).y[:, -1]
     # What was sent, and what was not but moves the reference, make the input together.
-    step = plant.a @ seen(np.array(start)) + plant.b @ [u + 0.3] + plant.e @ [wind, -0.3, gains]
-    np.testing.assert_allclose(step, seen(end), rtol=0.0, atol=1e-9)
+    step = plant.a @ observed(np.array(start)) + plant.b @ [u + 0.3] + plant.e @ [wind, -0.3, gains]
+    np.testing.assert_allclose(step, observed(end), rtol=0.0, atol=1e-9)
 
 
 def test_a_part_of_a_step_is_the_plant_of_that_step() -> None:
     part = velocity_reference([AXIS], 0.3 * DT, ("north",))
-    for ours, theirs in zip(held().transition(0.3 * DT), (part.a, part.b, part.e), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-12)
+    for outcome, reference in zip(held().transition(0.3 * DT), (part.a, part.b, part.e), strict=True):
+        np.testing.assert_allclose(outcome, reference, rtol=0.0, atol=1e-12)
 
 
 @given(
@@ -127,25 +127,25 @@ def test_every_such_plant_has_a_motion_within_the_step(
 
 
 def test_the_force_gains_its_drift_in_a_second() -> None:
-    """However long the steps are: what the disturbance adds to the sum a + f in each adds up."""
+    """For any step, the variances of the changes of a + f add up."""
     for dt_s in (0.05, 0.2):
         plant = velocity_reference([AXIS], dt_s, ("north",))
         assert np.sqrt(plant.w[2, 2] * dt_s**2 / dt_s) == pytest.approx(AXIS.force_drift_mps2_rts)
 
 
 def test_a_steady_force_is_held_without_an_input() -> None:
-    """It carries the vehicle away and back to where the reference is: the integral has learnt it."""
+    """A force moves the vehicle away and back to the reference: the integral compensates it."""
     plant = held()
-    x = seen(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]))
-    away = []
+    x = observed(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]))
+    offset = []
     for _ in range(round(20.0 / DT)):
         x = plant.a @ x
-        away.append(x[0])
-    assert 0.05 < max(away) < 0.5
+        offset.append(x[0])
+    assert 0.05 < max(offset) < 0.5
     np.testing.assert_allclose(x, 0.0, rtol=0.0, atol=1e-4)
 
 
-def test_it_rests_and_reaches_and_has_a_regulator() -> None:
+def test_the_plant_rests_is_reachable_and_has_a_regulator() -> None:
     plant = build_plant(load_config("room-hahn-stursberg", list(OVERRIDES)))
     assert (plant.n_x, plant.n_u, plant.n_w) == (3 * STATES_PER_AXIS, 3, 9)
     rest = plant.equilibrium((1.0, -2.0, -0.5))
@@ -156,7 +156,7 @@ def test_it_rests_and_reaches_and_has_a_regulator() -> None:
     assert np.abs(np.linalg.eigvals(plant.a + plant.b @ law.k)).max() < 1.0
 
 
-def test_positions_show_all_of_it() -> None:
+def test_positions_observe_all_states() -> None:
     plant = held()
     rows = [np.eye(STATES_PER_AXIS)[0]]
     for _ in range(STATES_PER_AXIS - 1):
@@ -164,8 +164,8 @@ def test_positions_show_all_of_it() -> None:
     assert np.linalg.matrix_rank(np.array(rows) / np.linalg.norm(rows, axis=1)[:, None]) == STATES_PER_AXIS
 
 
-def test_a_filter_of_positions_goes_on_correcting_the_reference() -> None:
-    """Whatever moved it: the covariance of its lead settles, and the error of an estimate dies out."""
+def test_a_filter_of_positions_keeps_correcting_the_reference() -> None:
+    """The covariance of the lead settles, and the error of an estimate vanishes."""
     plant, noise_m = held(), 0.003
     cov, shows = np.eye(STATES_PER_AXIS), np.eye(STATES_PER_AXIS)[:1]
     for _ in range(round(60.0 / DT)):
@@ -175,7 +175,7 @@ def test_a_filter_of_positions_goes_on_correcting_the_reference() -> None:
     assert np.abs(np.linalg.eigvals(loop)).max() < 0.999
 
 
-def test_its_states_have_names() -> None:
+def test_states_have_names() -> None:
     plant = held()
     names = names_of([], plant.n_x, plant.axes, plant.position_index, plant.velocity_index, plant.extra_states)
     assert names.states == (
@@ -191,8 +191,8 @@ def test_its_states_have_names() -> None:
 def test_the_simulators_own_reading_is_the_same() -> None:
     config = load_config("room-hahn-stursberg", list(OVERRIDES))
     plant, model = build_plant(config), make_linear_model(config.plant)
-    for ours, theirs in ((plant.a, model.a), (plant.b, model.b), (plant.e, model.e)):
-        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-12)
+    for outcome, reference in ((plant.a, model.a), (plant.b, model.b), (plant.e, model.e)):
+        np.testing.assert_allclose(outcome, reference, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(model.w_root @ model.w_root.T, plant.w, rtol=1e-12, atol=0.0)
     assert (model.position_index, model.velocity_index) == (plant.position_index, plant.velocity_index)
 
@@ -204,17 +204,17 @@ def flown(plant: Plant, wind: Wind, plan: list[tuple[float, float]], delay_s: fl
     delayed = np.concatenate([np.zeros(late), inputs])[: len(inputs)]
     vehicle = quadrotor("ardupilot", wind=wind)
     x = np.zeros(STATES_PER_AXIS)
-    ours, theirs = [], []
+    outcome, reference = [], []
     for step, (now, then) in enumerate(zip(inputs, delayed, strict=True)):
         vehicle.accelerate((float(now), 0.0, 0.0))
         vehicle.advance(round((step + 1) * DT * SECOND_NS))
         x = plant.a @ x + plant.b @ [then]
-        ours.append(x[0])
-        theirs.append(vehicle.position_m[0])
-    return np.array(theirs), np.array(ours)
+        outcome.append(x[0])
+        reference.append(vehicle.position_m[0])
+    return np.array(reference), np.array(outcome)
 
 
-def test_the_simulated_ardupilot_flies_so() -> None:
+def test_the_simulated_ardupilot_flies_like_the_plant() -> None:
     """The steps of the recordings, in still air; its jerk limit of 5 m/s³ makes each a ramp of 0.2 s, about 0.1 s late.
 
     The plant, begun at rest and told nothing on the way, is never a tenth of a metre off; a plant that flies the
@@ -233,27 +233,27 @@ def test_the_simulated_ardupilot_flies_so() -> None:
     assert max(off) > 1.0
 
 
-def test_the_simulated_ardupilot_holds_against_wind_so() -> None:
-    """Air that moves at 1 m/s pushes with drag times 1 m/s: a force from the first moment on, and it is learnt."""
+def test_the_simulated_ardupilot_holds_against_wind_like_the_plant() -> None:
+    """Air at 1 m/s pushes with drag times 1 m/s: a force from the start, which the integral compensates."""
     plant = held(drag_1ps=0.23, lag_s=0.1)
     vehicle, _ = flown(plant, steady((1.0, 0.0, 0.0)), [(6.0, 0.0)], 0.0)
-    x, ours = seen(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.23])), []
+    x, outcome = observed(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.23])), []
     for _ in vehicle:
         x = plant.a @ x
-        ours.append(x[0])
+        outcome.append(x[0])
     assert np.abs(vehicle).max() > 0.03
-    assert np.abs(vehicle - ours).max() < 0.25 * np.abs(vehicle).max()
+    assert np.abs(vehicle - outcome).max() < 0.25 * np.abs(vehicle).max()
 
 
 @pytest.mark.parametrize(
     ("changes", "key"), [({name: 0.0}, name) for name in ("lag_s", "position_1ps", "velocity_1ps", "integral_1ps2")]
 )
-def test_numbers_that_make_no_such_plant_are_refused(changes: dict[str, float], key: str) -> None:
+def test_invalid_numbers_are_refused(changes: dict[str, float], key: str) -> None:
     with pytest.raises(DesignError, match=rf"plant\.{key}"):
         held(**changes)
 
 
-def test_one_entry_an_axis_is_wanted() -> None:
+def test_a_wrong_number_of_entries_is_refused() -> None:
     with pytest.raises(DesignError, match="1 entries for 2 axes"):
         velocity_reference([AXIS], DT, ("north", "east"))
 
@@ -276,14 +276,14 @@ def test_a_configuration_that_does_not_fit_is_refused(override: str, words: str)
     assert any(words in problem for problem in caught.value.problems)
 
 
-def test_its_keys_mean_nothing_to_a_plant_that_flies_the_acceleration() -> None:
+def test_its_keys_have_no_effect_on_an_acceleration_plant() -> None:
     with pytest.raises(ConfigError) as caught:
         load_config("room-hahn-stursberg", ["plant.velocity_1ps=[2,2,5]"])
-    assert any('plant.velocity_1ps: has no meaning with model "drag-lag"' in one for one in caught.value.problems)
+    assert any('plant.velocity_1ps: has no meaning with model "drag-lag"' in item for item in caught.value.problems)
 
 
-def test_a_design_of_it_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    arguments = [part for one in (*OVERRIDES, "smpc.scheme=age-conditioned") for part in ("--set", one)]
+def test_a_design_of_it_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    arguments = [part for item in (*OVERRIDES, "smpc.scheme=age-conditioned") for part in ("--set", item)]
     assert main(["design", "--config", "room-hahn-stursberg", "--json", *arguments]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert len(found["rests"]) == 2 * 3 * STATES_PER_AXIS
+    result = json.loads(capsys.readouterr().out)
+    assert len(result["rests"]) == 2 * 3 * STATES_PER_AXIS

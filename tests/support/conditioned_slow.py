@@ -12,7 +12,7 @@ from uavctl.smpc.answer import Preview
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 
-ROUNDS, MOST_ROUNDS = 2, 3
+ROUNDS, MAX_ROUNDS = 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ def plan_slowly(
     taken = norm.sf(now / sigma)
     free = (room_u >= of_hard[:, 1:] @ z).all() and taken.max() <= 0.5 and (taken.sum(axis=1) <= budgets).all()
     near = np.logical_or.reduce(now < backoff) & np.ones(now.shape, dtype=bool)
-    for number in range(0 if free else MOST_ROUNDS):
+    for number in range(0 if free else MAX_ROUNDS):
         if number >= ROUNDS and (backoff <= now + 1e-6).all():
             break
         binds = now <= backoff + 1e-9 * sigma if number else near

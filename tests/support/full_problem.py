@@ -9,13 +9,13 @@ import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, make_horizon
 
 
 @cache
 def horizons(design: Design) -> list[tuple[Component, Horizon]]:
     """Components of a design with their predictions."""
-    return [(part, horizon_of(design, part)) for part in decompose(design)]
+    return [(part, make_horizon(design, part)) for part in decompose(design)]
 
 
 def gains(design: Design, thetas: list[Array]) -> Array:

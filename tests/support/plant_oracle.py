@@ -106,7 +106,7 @@ def margins(design: Design, solver: ConicSolver, x: Array) -> dict[str, float]:
     answer = solver.solve(0, x, design.target)
     gain = np.zeros((H, plant.n_u, H, plant.n_w))
     for part in solver._parts:
-        where, program = part.component, part._exact
+        where, program = part.component, part._hard
         horizon = program.horizon
         parameters = program.parameters(x[where.states], design.target[where.states])
         theta = program.conic.solve(parameters).variables[program.layout.theta]

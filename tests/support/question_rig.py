@@ -17,9 +17,9 @@ from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
-from uavctl.smpc.hahn_stursberg.exact import PartSolver, with_late
+from uavctl.smpc.hahn_stursberg.exact import PartSolver, add_late_designs
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.link import bernoulli
@@ -44,7 +44,7 @@ class Case:
 
     @cached_property
     def problems(self) -> list[MeanProblem]:
-        return [MeanProblem(self.design, horizon_of(self.design, part)) for part in self.components]
+        return [MeanProblem(self.design, make_horizon(self.design, part)) for part in self.components]
 
     @cached_property
     def policies(self) -> list[Policy]:
@@ -238,7 +238,7 @@ def _flown(question_case: Case, i: int, ask: Asked, answer: Answer) -> Array:
 def exact_gains(question_case: Case, i: int, ask: Asked) -> Array:
     """Gains (n_θ,) of the exact program's answer for a component."""
     part = question_case.components[i]
-    for program in (question_case.exact[i]._exact, question_case.exact[i]._missing):
+    for program in (question_case.exact[i]._hard, question_case.exact[i]._soft):
         solution = program.conic.solve(program.parameters(ask.x[part.states], ask.target[part.states], ask.preview))
         if solution.status == "Solved":
             break
@@ -265,4 +265,4 @@ def small_spec() -> DesignSpec:
 
 def small(late_steps: int = 0) -> Design:
     asked = small_spec()
-    return with_late(make_design(asked), asked, late_steps)
+    return add_late_designs(make_design(asked), asked, late_steps)

@@ -197,7 +197,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
     elif cov is None:
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
-    solver = ConditionedSolver(problem, link, max_risk, slew_mps3=slew_mps3, cov=cov, seen=estimator_plant)
+    solver = ConditionedSolver(problem, link, max_risk, slew_mps3=slew_mps3, cov=cov, filter_plant=estimator_plant)
     return ConditionedDesign(solver, cov, conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))
 
 
@@ -249,12 +249,12 @@ def build_design(config: Config) -> Design:
         DesignError: There is none; the error has key, reason and advice.
     """
     from uavctl.smpc.hahn_stursberg.design import make_design
-    from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost, with_late
+    from uavctl.smpc.hahn_stursberg.exact import add_late_designs, check_schedule, optimal_cost
 
     spec = build_spec(config)
     design = make_design(spec, optimal_cost)
     check_schedule(design)
-    return with_late(design, spec, compute_late_steps(config))
+    return add_late_designs(design, spec, compute_late_steps(config))
 
 
 def build_solver(design: AnyDesign, config: Config) -> Solver:
@@ -286,7 +286,7 @@ def build_solver(design: AnyDesign, config: Config) -> Solver:
 
 def compute_rest_limits(design: AnyDesign) -> Array:
     """Return the right sides (m_x,) of the state rows, less the back-offs of a plan at rest."""
-    return design.rests if isinstance(design, ConditionedDesign) else build_rest_limits(design)
+    return design.rest_limits if isinstance(design, ConditionedDesign) else build_rest_limits(design)
 
 
 def make_design_record(design: AnyDesign) -> dict[str, object]:

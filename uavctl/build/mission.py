@@ -96,7 +96,7 @@ def build_trajectory(
     motion = follow_positions(design.plant, positions_m, velocities_mps)
     _check_limits(motion, design)
     rest_range = compute_rest_range(design.plant, design.state_set, rest_limits)
-    return plan_along(design.plant, motion, design.horizon, design.settles, *rest_range)
+    return plan_along(design.plant, motion, design.horizon, design.rest_stage, *rest_range)
 
 
 def sample_trajectory(
@@ -141,7 +141,7 @@ def build_rest_limits(design: Design) -> Array:
 def _build_room(design: AnyDesign, rest_limits: Array) -> Room | None:
     try:
         rest_range = compute_rest_range(design.plant, design.state_set, rest_limits)
-        return make_room(design.plant, design.settles, *rest_range)
+        return make_room(design.plant, design.rest_stage, *rest_range)
     except DesignError:
         return None
 

@@ -150,7 +150,7 @@ def render_conditioned(
     """Return tables of the risk of each age and of the limits at rest, and warnings on the mission."""
     title = f"Risk by the age of information, design {design.design_id} of {name}"
     ages = make_table(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
-    risk, transit, problem = design.solver.risk, design.solver.risk_in_transit, design.solver.problem
+    risk, transit, problem = design.solver.risk, design.solver.transit_risk, design.solver.problem
     remaining = 1.0 - np.cumsum(risk.weights)
     listed_ages = min(problem.horizon, 1 + int(np.count_nonzero(remaining > _RARE_SHARE)))
     for age in range(listed_ages):
@@ -160,14 +160,14 @@ def render_conditioned(
         probability = f"{risk.weights[listed_ages:].sum():.3g}"
         budgets = (f"up to {spread.budgets[-1]:.2%}" for spread in (risk, transit))
         ages.add_row(f"{listed_ages + 1} to {problem.horizon}", probability, *budgets)
-    ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full", "counts in full")
+    ages.add_row(f"> {problem.horizon}", f"{risk.older_probability:.3g}", "counts in full", "counts in full")
     names = build_names(design)
     # A row of one entry limits -x from below where the entry is negative.
     sizes = problem.state_set.c.sum(axis=1)
     rows = (
         (row, f"{side / size:.3g}", f"{probability / size:.3g}", unit)
         for (row, unit, _), size, side, probability in zip(
-            names.rows, sizes, problem.state_set.b, design.rests, strict=True
+            names.rows, sizes, problem.state_set.b, design.rest_limits, strict=True
         )
     )
     headings = ("limit", "at", "rests up to", "unit")

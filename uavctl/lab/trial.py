@@ -268,7 +268,7 @@ def compute_exact_usable_share(config: Config, design: Design | None) -> float:
     n_x = build_plant(config).n_x
     conditioned = build_conditioned(config, for_flight=False, cov=np.zeros((n_x, n_x)))
     return _compute_volume_share(
-        config, *compute_rest_range(conditioned.plant, conditioned.state_set, conditioned.rests)
+        config, *compute_rest_range(conditioned.plant, conditioned.state_set, conditioned.rest_limits)
     )
 
 

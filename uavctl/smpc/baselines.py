@@ -62,7 +62,7 @@ class _OnReceipt(ABC):
     def begin(self, runs: int) -> None:
         """See `BatchController`."""
         self._plans = np.zeros((runs, self._problem.horizon, self._problem.plant.n_u))
-        self._made = np.zeros(runs, dtype=np.intp)
+        self._plan_step = np.zeros(runs, dtype=np.intp)
         self._captured = np.full(runs, -1, dtype=np.intp)
 
     def act(self, information: Information) -> Array:
@@ -70,9 +70,9 @@ class _OnReceipt(ABC):
         (has_new,) = np.nonzero(information.newest > self._captured)
         # x(0) is always known, so each run has a plan from the first step on.
         self._plans[has_new] = self._mpc.compute_plans(predict(self._problem.plant, information)[has_new])
-        self._made[has_new] = information.step
+        self._plan_step[has_new] = information.step
         self._captured[has_new] = information.newest[has_new]
-        return self._select_inputs(information.step - self._made)
+        return self._select_inputs(information.step - self._plan_step)
 
     @abstractmethod
     def _select_inputs(self, index: Index, /) -> Array:
@@ -207,13 +207,13 @@ def _prediction_gain(problem: ControlProblem, error: Array, step: Array, kappa_x
         k = lqr(plant, problem.q_x, weight * problem.q_u).k
         # Z = (A + B K_ρ) Z (A + B K_ρ)' + A^d N A'^d
         spread = solve_discrete_lyapunov(plant.a + plant.b @ k, step)
-        taken = max(
+        share = max(
             _find_largest_share(kappa_x * row_deviations(problem.state_set, error + spread), room_x),
             _find_largest_share(kappa_u * row_deviations(problem.input_set, k @ spread @ k.T), room_u),
         )
-        if taken < best[0]:
-            best = (taken, k)
-        if taken <= _MAX_SHARE:
+        if share < best[0]:
+            best = (share, k)
+        if share <= _MAX_SHARE:
             break
     if best[0] >= 1.0:
         raise DesignError(
@@ -321,9 +321,9 @@ class Lqg:
 
     def act(self, information: Information) -> Array:
         """See `BatchController`."""
-        off = predict(self._problem.plant, information) - self._problem.target
-        asked: Array = self._problem.u_target + off @ self._k.T
-        return asked
+        deviation = predict(self._problem.plant, information) - self._problem.target
+        inputs: Array = self._problem.u_target + deviation @ self._k.T
+        return inputs
 
 
 Flags = NDArray[np.bool_]
@@ -447,14 +447,14 @@ def _search_grid(dt_s: float, axes: int, cost: Cost) -> Array:
 def _search(best: Array, cost: Cost) -> Array:
     """Search from `best` (n,) on and return the best point."""
     rng = np.random.default_rng(_SEED)
-    least = float(cost(best[np.newaxis])[0])
+    lowest_cost = float(cost(best[np.newaxis])[0])
     mean, width = np.log(best), np.full(best.size, _WIDTH)
     for _ in range(_GENERATIONS):
         samples = mean + width * rng.standard_normal((_CANDIDATES, best.size))
         costs = cost(np.exp(samples))
         elite = samples[np.argsort(costs, kind="stable")[:_ELITE]]
-        if costs.min() < least:
-            least, best = float(costs.min()), np.exp(elite[0])
+        if costs.min() < lowest_cost:
+            lowest_cost, best = float(costs.min()), np.exp(elite[0])
         mean, width = elite.mean(axis=0), _SMOOTHING * width + (1.0 - _SMOOTHING) * elite.std(axis=0)
     return best
 
@@ -482,8 +482,8 @@ def _stage_cost(problem: ControlProblem, x: Array, u: Array, x_next: Array) -> A
     """Return the stage cost (M,) and the price of the next state's excess over its limits."""
     # (x - x_s)'Q_x(x - x_s) + (u - u_s)'Q_u(u - u_s) + Σ (ρ_1 s + ρ_2 s²),  s = max(C x⁺ - b, 0)
     off_x, off_u = x - problem.target, u - problem.u_target
-    beyond = np.maximum(x_next @ problem.state_set.c.T - problem.state_set.b, 0.0)
-    slack = problem.slack_linear * beyond + problem.slack_quadratic * beyond**2
+    excess = np.maximum(x_next @ problem.state_set.c.T - problem.state_set.b, 0.0)
+    slack = problem.slack_linear * excess + problem.slack_quadratic * excess**2
     cost: Array = np.sum(off_x @ problem.q_x * off_x, axis=1) + np.sum(off_u @ problem.q_u * off_u, axis=1)
     return np.asarray(cost + slack.sum(axis=1), dtype=np.float64)
 

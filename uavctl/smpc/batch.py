@@ -61,8 +61,8 @@ def predict(plant: Plant, information: Information) -> Array:
     x = information.state.copy()
     # x̂(i+1) = A x̂(i) + B u(i),  i = k-a … k-1
     for back in range(int(information.age.max(initial=0)), 0, -1):
-        (moved,) = np.nonzero(information.age >= back)
-        x[moved] = x[moved] @ plant.a.T + information.inputs[moved, information.step - back] @ plant.b.T
+        (runs,) = np.nonzero(information.age >= back)
+        x[runs] = x[runs] @ plant.a.T + information.inputs[runs, information.step - back] @ plant.b.T
     return x
 
 
@@ -73,8 +73,8 @@ def predict_covariance(plant: Plant, information: Information) -> Array | None:
     # P(i+1) = A P(i) A' + E W E',  i = k-a … k-1
     cov, noise_cov = information.cov.copy(), plant.e @ plant.w @ plant.e.T
     for back in range(int(information.age.max(initial=0)), 0, -1):
-        (moved,) = np.nonzero(information.age >= back)
-        cov[moved] = plant.a @ cov[moved] @ plant.a.T + noise_cov
+        (runs,) = np.nonzero(information.age >= back)
+        cov[runs] = plant.a @ cov[runs] @ plant.a.T + noise_cov
     return cov
 
 
@@ -111,9 +111,9 @@ class SequentialDecider:
     def decide(self, x: Array, age: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`."""
         preview = Preview(age=age)
-        states, which = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
+        states, index = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
         answers = [self._solver.solve(i, row, self._target, preview) for i, row in enumerate(states)]
-        return gather_answers([answers[i] for i in which.reshape(-1)], self._shape)
+        return gather_answers([answers[i] for i in index.reshape(-1)], self._shape)
 
 
 def gather_answers(answers: list[Answer], shape: tuple[int, int]) -> Decisions:
@@ -169,7 +169,7 @@ class BatchSmpc:
         """See `BatchController`."""
         steps, n_u = self._horizon, self._plant.n_u
         self._plans = np.zeros((runs, steps, n_u))
-        self._made = np.full(runs, -steps, dtype=np.intp)  # step of the plan's first input
+        self._plan_step = np.full(runs, -steps, dtype=np.intp)  # step of the plan's first input
         self._captured = np.full(runs, -1, dtype=np.intp)
         self.tally = Tally.zero(runs)
 
@@ -182,9 +182,9 @@ class BatchSmpc:
         cov = predict_covariance(self._plant, information)
         for j in np.unique(known_age[has_new]):
             self._replan(information, x, cov, np.flatnonzero(has_new & (known_age == j)), int(j))
-        index = information.step - self._made
+        index = information.step - self._plan_step
         playing = (index < steps) & (age < steps)
-        self._made[~playing] = -steps
+        self._plan_step[~playing] = -steps
         inputs = np.zeros((x.shape[0], self._plant.n_u))
         (runs_playing,) = np.nonzero(playing)
         inputs[runs_playing] = self._plans[runs_playing, index[runs_playing]]
@@ -198,7 +198,7 @@ class BatchSmpc:
         answers = self._decider.decide(x[asking], age, None if cov is None else cov[asking])
         planned = asking[answers.solved]
         self._plans[planned] = answers.inputs[answers.solved]
-        self._made[planned] = information.step
+        self._plan_step[planned] = information.step
         self._captured[planned] = information.newest[planned]
         tally = self.tally
         tally.decisions[asking] += 1

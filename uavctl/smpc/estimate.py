@@ -133,7 +133,7 @@ def innovation_form(
         DesignError: The filter's covariance does not settle.
     """
     n_x, filter_plant = plant.n_x, add_bias(plant, bias_drift) if bias_drift else plant
-    step = _FilterStep.of(filter_plant, position_std_m, sample_age_s)
+    step = _FilterStep.make(filter_plant, position_std_m, sample_age_s)
     p = _reachable_covariance(filter_plant)
     for _ in range(_MAX_STEPS):
         before, p = p, step.step_covariance(p, received=True)
@@ -176,7 +176,7 @@ class _FilterStep:
     position_noise: Array  # R (n_y, n_y)
 
     @classmethod
-    def of(cls, plant: Plant, position_std_m: float, sample_age_s: float) -> _FilterStep:
+    def make(cls, plant: Plant, position_std_m: float, sample_age_s: float) -> _FilterStep:
         n_y = len(plant.position_index)
         measurement = np.zeros((n_y, plant.n_x + plant.n_w))
         measurement[np.arange(n_y), plant.position_index] = 1.0

@@ -173,7 +173,7 @@ class LatePackets(_AgeChain):
     def outage(self, steps: int) -> float:
         """See `LinkModel`."""
         # P(a >= n) = ∏_{i<n} P(D > i)
-        return float(np.prod(self._beyond(steps + 1)[1:]))
+        return float(np.prod(self._tail_from(steps + 1)[1:]))
 
     def _start_mass(self, late: int) -> Array:
         mass = np.zeros((late + 1, 1))
@@ -181,18 +181,18 @@ class LatePackets(_AgeChain):
         return mass
 
     def _advance(self, mass: Array, _t: int, /) -> Array:
-        before, beyond = self._beyond(len(mass)), self._beyond(len(mass) + 1)[1:]  # P(D > i-1), P(D > i)
+        tail_before, tail = self._tail_from(len(mass)), self._tail_from(len(mass) + 1)[1:]  # P(D > i-1), P(D > i)
         # m⁺_i = (P(D > i-1) - P(D > i)) Σ_{j>=i} m_j + P(D > i-1) m_{i-1}
         at_least = np.cumsum(mass[::-1, 0])[::-1]
         after = np.zeros((len(mass) + 1, 1))
-        after[:-1, 0] = (before - beyond) * at_least
-        after[1:, 0] += beyond * mass[:, 0]
+        after[:-1, 0] = (tail_before - tail) * at_least
+        after[1:, 0] += tail * mass[:, 0]
         return after
 
-    def _beyond(self, count: int) -> Array:
+    def _tail_from(self, count: int) -> Array:
         """Return P(D > i) for i = -1 … `count` - 2."""
-        known = np.concatenate([[1.0], self.tail])[:count]
-        return np.concatenate([known, np.full(count - len(known), self.tail[-1])])
+        tail = np.concatenate([[1.0], self.tail])[:count]
+        return np.concatenate([tail, np.full(count - len(tail), self.tail[-1])])
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,8 +243,8 @@ def bernoulli(p: Array) -> Arrivals:
         DesignError: An entry is no probability.
     """
     _check_probabilities(p, "link.loss", "link's probabilities")
-    given = np.asarray(p, dtype=np.float64).reshape(-1, 1, 1)
-    return Arrivals(np.ones(1), given, 1.0 - given)
+    arrived = np.asarray(p, dtype=np.float64).reshape(-1, 1, 1)
+    return Arrivals(np.ones(1), arrived, 1.0 - arrived)
 
 
 def gilbert_elliott(

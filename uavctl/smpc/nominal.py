@@ -107,11 +107,11 @@ def _prediction_error_cost(plant: Plant, noise: Array, weight: Array, link: Link
 
 def _check_decay(plant: Plant, link: LinkModel) -> None:
     # r ρ(A)² < 1,  r = (P(a > 120) / P(a > 60))^(1/60)
-    early, late = link.outage(_EARLY), link.outage(_LATE)
-    if late <= 0.0:
+    outage_early, outage_late = link.outage(_EARLY), link.outage(_LATE)
+    if outage_late <= 0.0:
         return
     radius = float(np.abs(np.linalg.eigvals(plant.a)).max())
-    rate = (late / early) ** (1.0 / (_LATE - _EARLY))
+    rate = (outage_late / outage_early) ** (1.0 / (_LATE - _EARLY))
     if rate * radius**2 >= 1.0 - 1e-9:
         raise _unbounded_cost(f"P(a > i) falls by {rate:.6g} a step, and A's spectral radius is {radius:.6g}")
 
@@ -274,11 +274,11 @@ class _PartMpc:
 
     def _solve_program(self, room: Array) -> Array:
         """Solve for z; NaN without an optimum."""
-        nothing = np.full(self._z_rows.shape[1], np.nan)
+        no_optimum = np.full(self._z_rows.shape[1], np.nan)
         if not np.isfinite(room).all():
-            return nothing
-        solved = self._program.solve(np.zeros_like(nothing), room, self._open)
-        return nothing if solved is None else solved[0]
+            return no_optimum
+        solved = self._program.solve(np.zeros_like(no_optimum), room, self._open)
+        return no_optimum if solved is None else solved[0]
 
 
 def predict_regulated(problem: ControlProblem, law: Lqr, part: Part) -> tuple[Array, Array]:

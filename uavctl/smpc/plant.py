@@ -228,10 +228,10 @@ class Plant:
 
         It is unique only where each axis has its own input.
         """
-        wanted: Array = np.array([accel[column] for column in self._columns])
+        accel_of_axes: Array = np.array([accel[column] for column in self._columns])
         if self.accel_per_input.ndim == 1:
-            return wanted / self.accel_per_input
-        nearest: Array = np.linalg.pinv(self.accel_per_input) @ wanted
+            return accel_of_axes / self.accel_per_input
+        nearest: Array = np.linalg.pinv(self.accel_per_input) @ accel_of_axes
         return nearest
 
     def equilibrium(self, position_m: Vec3) -> Array:

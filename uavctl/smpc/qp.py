@@ -206,12 +206,12 @@ class FirstRows:
             fast = np.concatenate([slow[:since], fast[since:]])
         # Up to the stage where the regulator needs no more: z_t >= 0 with z = S⁻¹ fast
         z = self._z.dot(fast)
-        there = z[since:] >= 0.0
-        if there[0]:
+        is_reached = z[since:] >= 0.0
+        if is_reached[0]:
             return first_rows
-        count = since + (int(there.argmax()) or there.size)
-        left = self._z_columns[count][since:].dot(z[:count]) > high[since:]
-        if not np.count_nonzero(left):
+        count = since + (int(is_reached.argmax()) or is_reached.size)
+        leaves_row = self._z_columns[count][since:].dot(z[:count]) > high[since:]
+        if not np.count_nonzero(leaves_row):
             slews[since:count] = self._hard + towards
             return first_rows
         # If that leaves a state row: as long as the row can still be kept, then back.
@@ -223,20 +223,20 @@ class FirstRows:
             np.minimum(ramp, upper[self._inputs] * self._unit, out=top)
         gain = top - slow
         gain -= self._before
-        room, taken = (high - braked)[since:], None
+        room, used = (high - braked)[since:], None
         # Bisection over the last stage, from the one where the regulator needs no more
-        middle, count, beyond = count, since, self._steps + 1
-        while beyond - count > 1:
+        middle, count, infeasible = count, since, self._steps + 1
+        while infeasible - count > 1:
             of_gain = self._reached[middle]
             tried = (of_gain[since:] if since else of_gain).dot(gain[:middle])
             if np.count_nonzero(tried > room):
-                beyond = middle
+                infeasible = middle
             else:
-                count, taken = middle, tried
-            middle = (count + beyond) // 2
-        if taken is None:
-            taken = self._reached[since][since:].dot(gain[:since])
-        nearest = since + int((room - taken).argmin())
+                count, used = middle, tried
+            middle = (count + infeasible) // 2
+        if used is None:
+            used = self._reached[since][since:].dot(gain[:since])
+        nearest = since + int((room - used).argmin())
         slews[since:count] = self._hard + towards
         if self._inputs is not None:
             capped = ramp[since:count] > top[since:count]
@@ -245,7 +245,7 @@ class FirstRows:
                 first_rows[self._inputs][since:count][capped] = self._hard + towards
         slews[count + 1 : nearest + 1] = self._hard + against
         # The plan stays on the row for longer than a free plan is beyond it.
-        end = since + _find_last(left) + 1
+        end = since + _find_last(leaves_row) + 1
         end += int(_EXTRA_SHARE * (end - nearest))
         states[nearest + 1 : end : _ROW_SPACING] = self._soft + towards + KEEPS_LIMIT
         return first_rows

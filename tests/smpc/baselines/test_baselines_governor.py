@@ -1,4 +1,4 @@
-"""The governor and the mean QP: what they keep, and where they are the regulator."""
+"""The governor and the mean QP: their margins, and where they equal the regulator."""
 
 from __future__ import annotations
 
@@ -13,79 +13,81 @@ from uavctl.smpc.batch import Information, predict
 from uavctl.smpc.nominal import ControlProblem, lqr
 
 
-def sigma(given: ControlProblem, steps: int) -> Array:
+def sigma(case: ControlProblem, steps: int) -> Array:
     """Standard deviation (m,) of each row after so many steps without a position."""
-    plant, cov = given.plant, np.zeros((given.plant.n_x, given.plant.n_x))
+    plant, cov = case.plant, np.zeros((case.plant.n_x, case.plant.n_x))
     for _ in range(steps):
         cov = plant.a @ cov @ plant.a.T + plant.e @ plant.w @ plant.e.T
-    return np.asarray(np.sqrt(np.diagonal(given.state_set.c @ cov @ given.state_set.c.T)))
+    return np.asarray(np.sqrt(np.diagonal(case.state_set.c @ cov @ case.state_set.c.T)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
-def test_the_governor_keeps_the_next_mean_its_margin_and_is_as_near_to_the_regulator_as_that_allows(name: str) -> None:
-    given, rng = problem(name, slack_linear=1e3, slack_quadratic=10.0), np.random.default_rng(4)
-    plant, controller, margin = given.plant, Governor(given, 2.5), 2.5
-    low, high = (np.where(np.isfinite(side), side, 0.0) for side in given.state_set.bounds)
-    moved = 0
+def test_the_governor_keeps_its_margin_nearest_to_the_regulator(name: str) -> None:
+    case, rng = problem(name, slack_linear=1e3, slack_quadratic=10.0), np.random.default_rng(4)
+    plant, controller, margin = case.plant, Governor(case, 2.5), 2.5
+    low, high = (np.where(np.isfinite(side), side, 0.0) for side in case.state_set.bounds)
+    shifted = 0
     for age in (0, 0, 1, 3, 0, 2, 0, 1):
         states = rng.uniform(0.95 * low, 0.95 * high, (20, plant.n_x))
         inputs = 0.1 * rng.normal(size=(20, 5, plant.n_u))
         information = Information(5, np.full(20, 5 - age), states, inputs)
-        asked, x = controller.act(information), predict(plant, information)
-        wanted = given.u_target + (x - given.target) @ lqr(plant, given.q_x, given.q_u).k.T
+        requested, x = controller.act(information), predict(plant, information)
+        expected = case.u_target + (x - case.target) @ lqr(plant, case.q_x, case.q_u).k.T
         for i in range(0, 20, 4):
-            u, slack = cp.Variable(plant.n_u), cp.Variable(given.state_set.b.size, nonneg=True)
-            clipped = np.clip(wanted[i], *given.input_set.bounds)
-            kept = given.state_set.b - margin * sigma(given, age + 1)
+            u, slack = cp.Variable(plant.n_u), cp.Variable(case.state_set.b.size, nonneg=True)
+            clipped = np.clip(expected[i], *case.input_set.bounds)
+            kept = case.state_set.b - margin * sigma(case, age + 1)
             asking = cp.Problem(
                 cp.Minimize(
                     cp.sum_squares(u - clipped)
-                    + given.slack_linear * cp.sum(slack)
-                    + given.slack_quadratic * cp.sum_squares(slack)
+                    + case.slack_linear * cp.sum(slack)
+                    + case.slack_quadratic * cp.sum_squares(slack)
                 ),
                 [
-                    given.state_set.c @ (plant.a @ x[i] + plant.b @ u) <= kept + slack,
-                    given.input_set.c @ u <= given.input_set.b,
+                    case.state_set.c @ (plant.a @ x[i] + plant.b @ u) <= kept + slack,
+                    case.input_set.c @ u <= case.input_set.b,
                 ],
             )
             asking.solve(solver=cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
-            assert asked[i] == pytest.approx(u.value, abs=1e-3)
-            moved += bool(np.abs(asked[i] - clipped).max() > 1e-3)
-    assert moved
+            assert requested[i] == pytest.approx(u.value, abs=1e-3)
+            shifted += bool(np.abs(requested[i] - clipped).max() > 1e-3)
+    assert shifted
 
 
 def test_without_limits_the_governor_is_the_regulator() -> None:
-    given = unlimited(problem("paper"))
-    newest, disturbances = arrivals(5, 30, 0.3, 2), noise(given, 5, 30, 3)
-    ours, theirs = (flown(given, one, PAPER_START, newest, disturbances) for one in (Governor(given, 2.5), Lqg(given)))
-    assert ours.states == pytest.approx(theirs.states, abs=1e-7)
+    case = unlimited(problem("paper"))
+    newest, disturbances = arrivals(5, 30, 0.3, 2), noise(case, 5, 30, 3)
+    outcome, reference = (
+        flown(case, item, PAPER_START, newest, disturbances) for item in (Governor(case, 2.5), Lqg(case))
+    )
+    assert outcome.states == pytest.approx(reference.states, abs=1e-7)
 
 
 def test_the_plans_of_the_mean_qp_keep_a_margin_that_grows_with_the_age() -> None:
-    given, margin = problem("paper"), 2.0
-    controller, plain = MeanQp(given, margin), PacketisedPredictive(given)
+    case, margin = problem("paper"), 2.0
+    controller, plain = MeanQp(case, margin), PacketisedPredictive(case)
     information = Information(0, np.zeros(1, dtype=np.intp), PAPER_START[None], np.zeros((1, 0, 2)))
-    for one in (controller, plain):
-        one.begin(1)
-        one.act(information)
+    for item in (controller, plain):
+        item.begin(1)
+        item.act(information)
 
-    def left(one: PacketisedPredictive) -> Array:
+    def left(item: PacketisedPredictive) -> Array:
         """What a plan leaves of the room of each row, in standard deviations (H, m)."""
-        state, found = PAPER_START, []
-        for t, u in enumerate(one._plans[0], start=1):
-            state = given.plant.a @ state + given.plant.b @ u
-            found.append(given.state_set.margin(state) / sigma(given, t))
-        return np.array(found)
+        state, result = PAPER_START, []
+        for t, u in enumerate(item._plans[0], start=1):
+            state = case.plant.a @ state + case.plant.b @ u
+            result.append(case.state_set.margin(state) / sigma(case, t))
+        return np.array(result)
 
     assert left(controller).min() == pytest.approx(margin, abs=1e-6)  # a row binds
     assert left(plain).min() < 0.6 * margin
 
 
 def test_a_larger_margin_breaks_fewer_limits_and_costs_more() -> None:
-    given = problem("paper")
-    newest, disturbances = arrivals(200, 30, 0.3, 8), noise(given, 200, 30, 9)
+    case = problem("paper")
+    newest, disturbances = arrivals(200, 30, 0.3, 8), noise(case, 200, 30, 9)
     for maker in (MeanQp, Governor):
-        little, much = (flown(given, maker(given, one), PAPER_START, newest, disturbances) for one in (0.5, 3.0))
+        little, much = (flown(case, maker(case, item), PAPER_START, newest, disturbances) for item in (0.5, 3.0))
         assert much.state_violated.sum() < 0.3 * little.state_violated.sum()
         assert much.cost.sum() > little.cost.sum()

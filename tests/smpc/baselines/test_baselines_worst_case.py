@@ -1,4 +1,4 @@
-"""MPC for the worst-case delay: what it knows, and how much room it leaves."""
+"""MPC for the worst-case delay: its information and its back-offs."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from uavctl.smpc.nominal import ControlProblem, lqr
 DELAY = 4
 
 
-def asked_in(given: ControlProblem, states: Array, newest: NDArray[np.intp], inputs: Array) -> Array:
-    """What is asked for in each step (T, n_u) along a trajectory that goes its own way."""
-    controller = WorstCaseDelay(given, DELAY, 1.0, 1.0)
+def asked_in(case: ControlProblem, states: Array, newest: NDArray[np.intp], inputs: Array) -> Array:
+    """Return the inputs of each step (T, n_u) along a given trajectory."""
+    controller = WorstCaseDelay(case, DELAY, 1.0, 1.0)
     controller.begin(1)
     return np.array(
         [
@@ -30,63 +30,63 @@ def asked_in(given: ControlProblem, states: Array, newest: NDArray[np.intp], inp
     )
 
 
-def test_what_is_newer_than_the_delay_changes_nothing_and_what_is_older_does() -> None:
-    given, rng = replace(problem("paper"), input_set=cube(2, 100.0)), np.random.default_rng(1)
+def test_only_positions_older_than_the_delay_have_an_effect() -> None:
+    case, rng = replace(problem("paper"), input_set=cube(2, 100.0)), np.random.default_rng(1)
     steps, newest = 12, arrivals(1, 12, 0.3, 2)[0]
     states, inputs = 3.0 * rng.normal(size=(steps, 4)), rng.normal(size=(steps, 2))
-    known = asked_in(given, states, newest, inputs)
+    known = asked_in(case, states, newest, inputs)
     for k in range(steps):
         other = states.copy()
         other[max(1, k - DELAY + 1) :] += 1.0  # younger than the delay in step k; x(0) is known from the start
-        assert asked_in(given, other, newest, inputs)[k].tobytes() == known[k].tobytes()
+        assert asked_in(case, other, newest, inputs)[k].tobytes() == known[k].tobytes()
         used = int(newest[: k + 1][newest[: k + 1] <= max(0, k - DELAY)].max())
         other = states.copy()
         other[used] += 0.1
-        assert np.abs(asked_in(given, other, newest, inputs)[k] - known[k]).max() > 1e-6
+        assert np.abs(asked_in(case, other, newest, inputs)[k] - known[k]).max() > 1e-6
 
 
 def test_without_limits_it_is_the_regulator_on_the_delayed_prediction() -> None:
-    """All positions arrive at once, and it flies as LQG does that gets them `DELAY` steps late."""
-    given = unlimited(problem("paper"))
-    steps, disturbances = 40, noise(given, 5, 40, 3)
+    """With all positions at once it flies like an LQG that gets them `DELAY` steps late."""
+    case = unlimited(problem("paper"))
+    steps, disturbances = 40, noise(case, 5, 40, 3)
     at_once = np.tile(np.arange(steps), (5, 1))
     late = np.maximum(at_once - DELAY, 0)
-    ours = flown(given, WorstCaseDelay(given, DELAY, 1.0, 1.0), PAPER_START, at_once, disturbances)
-    theirs = flown(given, Lqg(given), PAPER_START, late, disturbances)
-    assert ours.states == pytest.approx(theirs.states, abs=1e-7)
+    result = flown(case, WorstCaseDelay(case, DELAY, 1.0, 1.0), PAPER_START, at_once, disturbances)
+    expected = flown(case, Lqg(case), PAPER_START, late, disturbances)
+    assert result.states == pytest.approx(expected.states, abs=1e-7)
 
 
 def test_a_link_that_is_worse_gives_older_information() -> None:
     """A position that comes older than the delay is used at once."""
-    given = unlimited(problem("paper"))
-    k = lqr(given.plant, given.q_x, given.q_u).k
-    fed = Fed(given, WorstCaseDelay(given, 2, 1.0, 1.0), PAPER_START)
+    case = unlimited(problem("paper"))
+    k = lqr(case.plant, case.q_x, case.q_u).k
+    fed = Fed(case, WorstCaseDelay(case, 2, 1.0, 1.0), PAPER_START)
     fed.step(0)
     fed.states[1] = np.ones(4)  # not where the prediction says it was: news, once it comes
     for newest in (0, 0, 0, 0, 1):
-        asked = fed.step(newest)
+        requested = fed.step(newest)
     x = np.ones(4)
     for u in fed.inputs[0, 1:5]:
-        x = given.plant.a @ x + given.plant.b @ u
-    assert asked == pytest.approx(k @ x, abs=1e-9)
+        x = case.plant.a @ x + case.plant.b @ u
+    assert requested == pytest.approx(k @ x, abs=1e-9)
 
 
 def test_back_offs_are_the_spread_of_the_delayed_loop() -> None:
     """Simulated: 40,000 plans of the same mean, each with its own unknown past."""
-    given, runs, rng = problem("paper"), 40_000, np.random.default_rng(9)
-    plant = given.plant
-    backoff_x, backoff_u = _backoffs(given, DELAY, 1.0, 1.0)
+    case, runs, rng = problem("paper"), 40_000, np.random.default_rng(9)
+    plant = case.plant
+    backoff_x, backoff_u = _backoffs(case, DELAY, 1.0, 1.0)
     error = sum(power @ plant.e @ plant.w @ plant.e.T @ power.T for power in powers(plant.a, DELAY))
     step = np.linalg.matrix_power(plant.a, DELAY) @ plant.e
-    k = _prediction_gain(given, np.asarray(error), step @ plant.w @ step.T, 1.0, 1.0)
-    w = np.sqrt(0.6) * rng.standard_normal((DELAY + given.horizon, runs, 2))
+    k = _prediction_gain(case, np.asarray(error), step @ plant.w @ step.T, 1.0, 1.0)
+    w = np.sqrt(0.6) * rng.standard_normal((DELAY + case.horizon, runs, 2))
     x, mean = np.zeros((runs, 4)), np.zeros((runs, 4))
     for past in w[:DELAY]:
         x = x @ plant.a.T + past @ plant.e.T
-    for t in range(given.horizon):
+    for t in range(case.horizon):
         u = mean @ k.T
-        assert backoff_x[t] == pytest.approx((x @ given.state_set.c.T).std(axis=0), rel=0.02)
-        assert backoff_u[t] == pytest.approx((u @ given.input_set.c.T).std(axis=0), rel=0.02, abs=1e-12)
+        assert backoff_x[t] == pytest.approx((x @ case.state_set.c.T).std(axis=0), rel=0.02)
+        assert backoff_u[t] == pytest.approx((u @ case.input_set.c.T).std(axis=0), rel=0.02, abs=1e-12)
         x = x @ plant.a.T + u @ plant.b.T + w[DELAY + t] @ plant.e.T
         mean = mean @ plant.a.T + u @ plant.b.T + w[t] @ step.T
     assert np.all(np.diff(backoff_x, axis=0) >= 0.0)
@@ -96,11 +96,11 @@ def powers(a: Array, count: int) -> list[Array]:
     return [np.linalg.matrix_power(a, i) for i in range(count)]
 
 
-def test_it_keeps_further_from_the_limits_than_a_plan_without_back_offs() -> None:
-    given, runs = problem("paper"), 200
-    newest, disturbances = arrivals(runs, 50, 0.3, 1), noise(given, runs, 50, 2)
+def test_plans_keep_more_distance_from_the_limits_than_without_back_offs() -> None:
+    case, runs = problem("paper"), 200
+    newest, disturbances = arrivals(runs, 50, 0.3, 1), noise(case, runs, 50, 2)
     cautious, bold = (
-        flown(given, WorstCaseDelay(given, DELAY, kappa, kappa), PAPER_START, newest, disturbances)
+        flown(case, WorstCaseDelay(case, DELAY, kappa, kappa), PAPER_START, newest, disturbances)
         for kappa in (2.5, 1e-9)
     )
     assert not cautious.input_violated.any()
@@ -108,7 +108,7 @@ def test_it_keeps_further_from_the_limits_than_a_plan_without_back_offs() -> Non
 
 
 @pytest.mark.parametrize(("state", "control"), [(2.0, 7.5), (20.0, 0.05)])
-def test_no_room_no_controller(state: float, control: float) -> None:
+def test_a_delay_without_room_is_refused(state: float, control: float) -> None:
     tight = replace(problem("paper"), state_set=cube(4, state), input_set=cube(2, control))
     with pytest.raises(DesignError, match="room") as refused:
         WorstCaseDelay(tight, DELAY, 3.0, 2.0)
@@ -117,9 +117,9 @@ def test_no_room_no_controller(state: float, control: float) -> None:
 
 @pytest.mark.parametrize("position_m", [50.0, 60.0])
 def test_a_target_at_a_limit_or_beyond_leaves_no_room(position_m: float) -> None:
-    given = problem("paper")
+    case = problem("paper")
     with pytest.raises(DesignError, match="room"):
-        WorstCaseDelay(replace(given, target=np.array([position_m, 0.0, 0.0, 0.0])), DELAY, 1.0, 1.0)
+        WorstCaseDelay(replace(case, target=np.array([position_m, 0.0, 0.0, 0.0])), DELAY, 1.0, 1.0)
 
 
 def test_no_delay_is_refused() -> None:

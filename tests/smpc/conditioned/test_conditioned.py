@@ -1,4 +1,4 @@
-"""Risk conditioned on the age: against the same problem in CVXPY, against its own promise, against chance."""
+"""Risk conditioned on the age: against the same problem in CVXPY, its allowed risk, and simulations."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.baselines import PacketisedPredictive
 from uavctl.smpc.batch import BatchSmpc
-from uavctl.smpc.conditioned.backoffs import SELDOM, age_risk, equal_risk
-from uavctl.smpc.conditioned.planner import METHOD, MOST_SHIFTING, ConditionedDecider, ConditionedSolver
+from uavctl.smpc.conditioned.backoffs import RARE_SHARE, spread_risk, spread_risk_equally
+from uavctl.smpc.conditioned.planner import MAX_SHIFT_ITERATIONS, METHOD, ConditionedDecider, ConditionedSolver
 from uavctl.smpc.link import bernoulli, gilbert_elliott
 from uavctl.smpc.nominal import ControlProblem, lqr
 
@@ -31,63 +31,63 @@ KINDS = ["plain", "covariance", "fence", "path", "sent"]
 
 
 def in_cvxpy(
-    given: ControlProblem, x: Array, answer: Answer, preview: Preview, slew_mps3: float = np.inf
+    case: ControlProblem, x: Array, answer: Answer, preview: Preview, slew_mps3: float = np.inf
 ) -> tuple[float, Array]:
     """Least cost and inputs (H, n_u) with the back-offs, the reference and the limits of an answer."""
-    plant, steps, reference = given.plant, given.horizon, answer.reference
+    plant, steps, reference = case.plant, case.horizon, answer.reference
     hold = np.linalg.lstsq(plant.b, reference - plant.a @ reference)[0]
-    limits = np.tile(given.state_set.b, (steps + 1, 1)) if preview.limits is None else preview.limits
+    limits = np.tile(case.state_set.b, (steps + 1, 1)) if preview.limits is None else preview.limits
     path = preview.path or Path(np.zeros((steps, plant.n_x)), np.zeros((steps, plant.n_u)))
     states, inputs = cp.Variable((steps + 1, plant.n_x)), cp.Variable((steps, plant.n_u))
-    slack = cp.Variable((steps, given.state_set.b.size), nonneg=True)
+    slack = cp.Variable((steps, case.state_set.b.size), nonneg=True)
     rules = [states[0] == x]
     for t in range(steps):
         rules += [
             states[t + 1] == plant.a @ states[t] + plant.b @ inputs[t],
-            given.input_set.c @ inputs[t] <= given.input_set.b,
-            given.state_set.c @ states[t + 1] <= limits[t + 1] - answer.backoff_x[t + 1] + slack[t],
+            case.input_set.c @ inputs[t] <= case.input_set.b,
+            case.state_set.c @ states[t + 1] <= limits[t + 1] - answer.backoff_x[t + 1] + slack[t],
         ]
     d, side = plant.accel_map, slew_mps3 * plant.dt_s
     if np.isfinite(side):
         rules += [cp.abs(d @ (inputs[t] - inputs[t - 1])) <= side for t in range(1, steps)]
         if preview.sent is not None:
-            rules.append(cp.abs(d @ (inputs[0] - preview.sent)) <= first_side(given, side, preview.sent))
+            rules.append(cp.abs(d @ (inputs[0] - preview.sent)) <= first_side(case, side, preview.sent))
     dx, du = states[:-1] - reference - path.states, inputs - hold - path.inputs
-    root_x, root_u = np.linalg.cholesky(given.q_x).T, np.linalg.cholesky(given.q_u).T
-    tail = np.linalg.cholesky(lqr(plant, given.q_x, given.q_u).p).T
+    root_x, root_u = np.linalg.cholesky(case.q_x).T, np.linalg.cholesky(case.q_u).T
+    tail = np.linalg.cholesky(lqr(plant, case.q_x, case.q_u).p).T
     cost = (
         sum(cp.sum_squares(root_x @ dx[t]) + cp.sum_squares(root_u @ du[t]) for t in range(steps))
         + cp.sum_squares(tail @ (states[steps] - reference))
-        + given.slack_linear * cp.sum(slack)
-        + given.slack_quadratic * cp.sum_squares(slack)
+        + case.slack_linear * cp.sum(slack)
+        + case.slack_quadratic * cp.sum_squares(slack)
     )
-    asked = cp.Problem(cp.Minimize(cost), rules)
-    asked.solve(
+    reference = cp.Problem(cp.Minimize(cost), rules)
+    reference.solve(
         solver=cp.CLARABEL, canon_backend=cp.SCIPY_CANON_BACKEND, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11
     )
-    return float(asked.value), np.asarray(inputs.value)
+    return float(reference.value), np.asarray(inputs.value)
 
 
-def somewhere(given: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
+def somewhere(case: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
     """A state within wide limits, and a target that may be beyond them."""
-    low, high = (np.where(np.isfinite(side), side, 0.0) for side in given.state_set.bounds)
+    low, high = (np.where(np.isfinite(side), side, 0.0) for side in case.state_set.bounds)
     x = rng.uniform(low, high)
-    places = rng.uniform(1.1 * low, 1.1 * high)[list(given.plant.position_index)]
-    at = dict(zip(given.plant.axes, places.tolist(), strict=True))
-    return x, given.plant.equilibrium((at.get("north", 0.0), at.get("east", 0.0), at.get("down", 0.0)))
+    places = rng.uniform(1.1 * low, 1.1 * high)[list(case.plant.position_index)]
+    at = dict(zip(case.plant.axes, places.tolist(), strict=True))
+    return x, case.plant.equilibrium((at.get("north", 0.0), at.get("east", 0.0), at.get("down", 0.0)))
 
 
-def draw_preview(kind: str, given: ControlProblem, rng: np.random.Generator) -> Preview:
-    steps, n_x, n_u = given.horizon, given.plant.n_x, given.plant.n_u
+def draw_preview(kind: str, case: ControlProblem, rng: np.random.Generator) -> Preview:
+    steps, n_x, n_u = case.horizon, case.plant.n_x, case.plant.n_u
     if kind == "covariance":
         root = rng.normal(size=(n_x, n_x)) * 0.1
         return Preview(cov=root @ root.T, age=2)
     if kind == "fence":
-        return Preview(limits=given.state_set.b * rng.uniform(0.8, 1.0, (steps + 1, given.state_set.b.size)))
+        return Preview(limits=case.state_set.b * rng.uniform(0.8, 1.0, (steps + 1, case.state_set.b.size)))
     if kind == "path":
         return Preview(path=Path(rng.normal(size=(steps, n_x)), 0.3 * rng.normal(size=(steps, n_u))))
     if kind == "sent":  # some of it beyond the limits of what is planned
-        return Preview(sent=1.4 * rng.uniform(*given.input_set.bounds))
+        return Preview(sent=1.4 * rng.uniform(*case.input_set.bounds))
     return NOMINAL
 
 
@@ -96,32 +96,32 @@ def draw_preview(kind: str, given: ControlProblem, rng: np.random.Generator) -> 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_the_answer_is_the_optimum_of_the_same_problem(name: str, kind: str, slewed: bool) -> None:
-    given, rng = problem(name), np.random.default_rng(5)
+    case, rng = problem(name), np.random.default_rng(5)
     slew_mps3 = SLEW_MPS3[name] if slewed else np.inf
-    solver = ConditionedSolver(given, LINK, ALLOWED, slew_mps3=slew_mps3)
+    solver = ConditionedSolver(case, LINK, ALLOWED, slew_mps3=slew_mps3)
     compared = 0
     for seq in range(6):
-        x, target = somewhere(given, rng)
-        preview = draw_preview(kind, given, rng)
+        x, target = somewhere(case, rng)
+        preview = draw_preview(kind, case, rng)
         answer = solver.solve(seq, x, target, preview)
         assert (answer.seq, answer.status, answer.method) == (seq, SolveStatus.OPTIMAL, METHOD)
-        sides = (given.state_set.b if preview.limits is None else preview.limits) - answer.backoff_x
-        if (met(given, sides) != sides).any():
+        sides = (case.state_set.b if preview.limits is None else preview.limits) - answer.backoff_x
+        if (met(case, sides) != sides).any():
             continue  # where two back-offs meet the mean keeps to their middle, and the slack may be elsewhere here
         compared += 1
-        cost, inputs = in_cvxpy(given, x, answer, preview, slew_mps3)
+        cost, inputs = in_cvxpy(case, x, answer, preview, slew_mps3)
         assert answer.cost == pytest.approx(cost, rel=1e-7)
         # The cost rises at least as the square of what z is off by, and theirs is known to about 1e-11 of it.
         assert answer.inputs == pytest.approx(inputs, abs=2e-4 + np.sqrt(1e-11 * cost))
         assert answer.states[1:] == pytest.approx(
-            answer.states[:-1] @ given.plant.a.T + answer.inputs @ given.plant.b.T, abs=1e-9
+            answer.states[:-1] @ case.plant.a.T + answer.inputs @ case.plant.b.T, abs=1e-9
         )
     assert compared > 3
 
 
-def near(given: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
+def near(case: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
     """A state and a target as most of a flight's are: near to one another, where few rows bind or none."""
-    x, target = somewhere(given, rng)
+    x, target = somewhere(case, rng)
     return target + rng.uniform(0.0, 0.3) * (x - target), target
 
 
@@ -132,48 +132,48 @@ def near(given: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]
 def test_no_short_cut_changes_the_answer(
     name: str, where: Callable[[ControlProblem, np.random.Generator], tuple[Array, Array]], kind: str
 ) -> None:
-    """Against every row in one program for the whole plant, solved anew in every round."""
-    given, rng = problem(name), np.random.default_rng(6)
-    solver = ConditionedSolver(given, LINK, ALLOWED, slew_mps3=SLEW_MPS3[name])
+    """Reference: all rows in one program for the whole plant, solved from the start in each round."""
+    case, rng = problem(name), np.random.default_rng(6)
+    solver = ConditionedSolver(case, LINK, ALLOWED, slew_mps3=SLEW_MPS3[name])
     compared = 0
     for seq in range(12):
-        x, target = where(given, rng)
-        preview = draw_preview(kind, given, rng)
+        x, target = where(case, rng)
+        preview = draw_preview(kind, case, rng)
         answer = solver.solve(seq, x, target, preview)
-        if answer.iterations > MOST_SHIFTING:
+        if answer.iterations > MAX_SHIFT_ITERATIONS:
             continue  # it has ended its rounds early
         compared += 1
         slow = plan_slowly(
-            given, solver.risk_towards(target, preview).shares, x, answer.reference, preview, SLEW_MPS3[name]
+            case, solver.select_risk(target, preview).shares, x, answer.reference, preview, SLEW_MPS3[name]
         )
         assert answer.inputs == pytest.approx(slow.inputs, abs=1e-6)
         assert answer.slack == pytest.approx(slow.slack, abs=1e-6)
     assert compared > 8
 
 
-def spent(given: ControlProblem, answer: Answer, cov: Array) -> Array:
+def spent(case: ControlProblem, answer: Answer, cov: Array) -> Array:
     """Risk (H,) that the rows of each stage take together, from the definition of the open-loop covariance."""
-    plant, risk = given.plant, []
+    plant, risk = case.plant, []
     for state in answer.states[1:]:
         cov = plant.a @ cov @ plant.a.T + plant.e @ plant.w @ plant.e.T
-        sigma = np.sqrt(np.diagonal(given.state_set.c @ cov @ given.state_set.c.T))
-        risk.append(norm.sf(given.state_set.margin(state) / sigma).sum())
+        sigma = np.sqrt(np.diagonal(case.state_set.c @ cov @ case.state_set.c.T))
+        risk.append(norm.sf(case.state_set.margin(state) / sigma).sum())
     return np.array(risk)
 
 
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: str) -> None:
-    given, rng = problem(name), np.random.default_rng(8)
-    solver = ConditionedSolver(given, LINK, ALLOWED)
+    case, rng = problem(name), np.random.default_rng(8)
+    solver = ConditionedSolver(case, LINK, ALLOWED)
     kept = 0
     for seq in range(60):
-        x, target = somewhere(given, rng)
-        cov = np.diag(rng.uniform(0.0, 0.01, given.plant.n_x))
+        x, target = somewhere(case, rng)
+        cov = np.diag(rng.uniform(0.0, 0.01, case.plant.n_x))
         answer = solver.solve(seq, x, target, Preview(cov=cov))
-        assert (answer.inputs @ given.input_set.c.T <= given.input_set.b + 1e-12).all()
+        assert (answer.inputs @ case.input_set.c.T <= case.input_set.b + 1e-12).all()
         if answer.slack == 0.0:
             kept += 1
-            assert (spent(given, answer, cov) <= solver.risk_towards(target).shares + 1e-9).all()
+            assert (spent(case, answer, cov) <= solver.select_risk(target).shares + 1e-9).all()
             assert not answer.relaxed
         else:
             assert sum(way.amount for way in answer.relaxed) == pytest.approx(answer.slack, abs=1e-3)
@@ -181,14 +181,14 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
 
 
 def test_the_weights_are_those_of_the_age() -> None:
-    risk = age_risk(LINK, np.linspace(1.0, 3.0, 12), ALLOWED)
+    risk = spread_risk(LINK, np.linspace(1.0, 3.0, 12), ALLOWED)
     assert risk.weights == pytest.approx((1.0 - LOSS) * LOSS ** np.arange(12))
-    assert risk.beyond == pytest.approx(LOSS**12)
+    assert risk.older_probability == pytest.approx(LOSS**12)
     assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - LOSS**12)
     assert (np.diff(risk.budgets) >= 0.0).all()
     assert risk.budgets.max() <= 0.5
     bursts = gilbert_elliott(enter=0.1, leave=0.4, good_loss=0.05, bad_loss=0.9)
-    weights = age_risk(bursts, np.ones(40), ALLOWED).weights
+    weights = spread_risk(bursts, np.ones(40), ALLOWED).weights
     older = [bursts.outage(age) for age in range(41)]
     assert weights == pytest.approx(-np.diff(older))
 
@@ -197,7 +197,7 @@ def test_the_weights_are_those_of_the_age() -> None:
 def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> None:
     """No shift of risk from one age to another lowers Σ π_t^h β_t."""
     sigma = np.array([0.4, 0.9, 1.5, 2.2, 3.0])
-    risk = age_risk(bernoulli(np.array([0.6])), sigma, 0.08, price)
+    risk = spread_risk(bernoulli(np.array([0.6])), sigma, 0.08, price)
     priced = risk.weights**price
 
     def paid(budgets: Array) -> float:
@@ -205,103 +205,103 @@ def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> 
 
     for i in range(5):
         for j in range(5):
-            moved = risk.budgets.copy()
-            moved[i] += 1e-4 / risk.weights[i]
-            moved[j] -= 1e-4 / risk.weights[j]
-            if i != j and moved.max() < 0.5 and moved.min() > 0.0:
-                assert paid(moved) > paid(risk.budgets) - 1e-9
-    assert risk.weights @ risk.budgets == pytest.approx(0.08 - risk.beyond)
+            shifted = risk.budgets.copy()
+            shifted[i] += 1e-4 / risk.weights[i]
+            shifted[j] -= 1e-4 / risk.weights[j]
+            if i != j and shifted.max() < 0.5 and shifted.min() > 0.0:
+                assert paid(shifted) > paid(risk.budgets) - 1e-9
+    assert risk.weights @ risk.budgets == pytest.approx(0.08 - risk.older_probability)
 
 
-def test_where_two_rows_share_the_risk_no_age_is_kept_away_by_it() -> None:
+def test_two_rows_that_share_the_risk_keep_no_rare_age_away() -> None:
     """At 10 % loss, ages of ten steps are all but never met: they take as much risk as rows can, in corners too."""
     rare = bernoulli(np.array([0.9]))
-    alone, shared = (age_risk(rare, np.linspace(0.4, 5.6, 12), ALLOWED, corner=n) for n in (1, 2))
-    for risk in (alone, shared):
-        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.beyond)
-    assert alone.budgets[-1] == pytest.approx(0.5)
+    single, shared = (spread_risk(rare, np.linspace(0.4, 5.6, 12), ALLOWED, corner=n) for n in (1, 2))
+    for risk in (single, shared):
+        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.older_probability)
+    assert single.budgets[-1] == pytest.approx(0.5)
     assert shared.budgets[-1] == pytest.approx(1.0)
-    given = problem("paper")
-    solver = ConditionedSolver(given, rare, ALLOWED)
+    case = problem("paper")
+    solver = ConditionedSolver(case, rare, ALLOWED)
     reference = solver.solve(0, PAPER_START, np.array([80.0, 0.0, 40.0, 0.0])).reference
-    assert given.state_set.margin(reference).min() < 2.0  # where each row had a half of one half it was 4 m
+    assert case.state_set.margin(reference).min() < 2.0  # where each row had a half of one half it was 4 m
 
 
-def test_in_transit_the_ages_share_alike_but_for_those_that_hardly_come() -> None:
+def test_in_transit_the_ages_share_equally_except_rare_ones() -> None:
     """Every age that keeps something back has the same risk, and all of what is allowed is used up."""
     for loss in (0.1, 0.3, 0.8):
-        risk = equal_risk(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, corner=2)
-        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.beyond)
+        risk = spread_risk_equally(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, corner=2)
+        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.older_probability)
         counts = np.isfinite(risk.shares)
         assert np.ptp(risk.budgets[counts]) == 0.0
         assert (np.diff(counts.astype(int)) <= 0).all()
-        left = SELDOM * (ALLOWED - risk.beyond)
+        left = RARE_SHARE * (ALLOWED - risk.older_probability)
         assert risk.weights[~counts].sum() <= left
         assert risk.weights[~counts].sum() + risk.weights[counts][-1] > left  # one more would be too many
 
 
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
-def test_which_spread_a_plan_has_goes_by_the_place_alone(name: str) -> None:
-    """Neither the state, its covariance, how late it was nor what was sent may choose: those go with the age."""
-    given, rng = problem(name), np.random.default_rng(14)
-    solver = ConditionedSolver(given, LINK, ALLOWED)
-    margin, told = given.state_set.margin(given.target), []
+def test_the_spread_of_a_plan_depends_on_the_target_alone(name: str) -> None:
+    """State, covariance, age and last input must not change it: they depend on the age."""
+    case, rng = problem(name), np.random.default_rng(14)
+    solver = ConditionedSolver(case, LINK, ALLOWED)
+    margin, reported = case.state_set.margin(case.target), []
     for share in np.linspace(0.0, 1.0, 21):
         # From the configured target towards the nearest limit of a position.
         row = min(
-            (i for i in range(len(margin)) if given.state_set.c[i, list(given.plant.position_index)].any()),
+            (i for i in range(len(margin)) if case.state_set.c[i, list(case.plant.position_index)].any()),
             key=lambda i: margin[i],
         )
-        target = given.target + share * margin[row] * given.state_set.c[row] / np.vdot(*[given.state_set.c[row]] * 2)
-        chosen = solver.risk_towards(target)
+        target = case.target + share * margin[row] * case.state_set.c[row] / np.vdot(*[case.state_set.c[row]] * 2)
+        chosen = solver.select_risk(target)
         for kind in ("covariance", "sent"):  # the first is late, too
-            assert solver.risk_towards(target, draw_preview(kind, given, rng)) is chosen
-        told.append(chosen is solver.risk_in_transit)
-        assert told[-1] or chosen is solver.risk
-    assert told[0]
-    assert not told[-1]
-    assert (np.diff(np.array(told, dtype=int)) <= 0).all()
-    assert solver.risk_towards(given.target, draw_preview("path", given, rng)) is solver.risk
-    narrow = np.tile(given.state_set.b - margin, (given.horizon + 1, 1))  # a fence that has come to the target
-    assert solver.risk_towards(given.target, replace(NOMINAL, limits=narrow)) is solver.risk
+            assert solver.select_risk(target, draw_preview(kind, case, rng)) is chosen
+        reported.append(chosen is solver.transit_risk)
+        assert reported[-1] or chosen is solver.risk
+    assert reported[0]
+    assert not reported[-1]
+    assert (np.diff(np.array(reported, dtype=int)) <= 0).all()
+    assert solver.select_risk(case.target, draw_preview("path", case, rng)) is solver.risk
+    narrow = np.tile(case.state_set.b - margin, (case.horizon + 1, 1))  # a fence that has come to the target
+    assert solver.select_risk(case.target, replace(NOMINAL, limits=narrow)) is solver.risk
 
 
 @pytest.mark.parametrize(("loss", "steps"), [(0.9, 12), (0.5, 3)])
-def test_a_horizon_that_silence_outlasts_is_refused(loss: float, steps: int) -> None:
+def test_a_horizon_shorter_than_silences_is_refused(loss: float, steps: int) -> None:
     with pytest.raises(DesignError, match=rf"smpc.horizon: positions are {steps} steps old or more in"):
-        age_risk(bernoulli(np.array([1.0 - loss])), np.ones(steps), ALLOWED)
+        spread_risk(bernoulli(np.array([1.0 - loss])), np.ones(steps), ALLOWED)
 
 
 def test_a_state_that_no_input_reaches_is_refused() -> None:
-    given = problem("paper")
-    b = given.plant.b.copy()
+    case = problem("paper")
+    b = case.plant.b.copy()
     b[2:] = 0.0
-    a = given.plant.a.copy()
+    a = case.plant.a.copy()
     a[2:, 2:] = 0.5 * np.eye(2)  # it comes to rest by itself
     with pytest.raises(DesignError, match=r"plant.b: states \[2, 3\] are reached by no input"):
-        ConditionedSolver(replace(given, plant=replace(given.plant, a=a, b=b)), LINK, ALLOWED)
+        ConditionedSolver(replace(case, plant=replace(case.plant, a=a, b=b)), LINK, ALLOWED)
 
 
 def test_nothing_disturbed_needs_no_back_off() -> None:
-    given = problem("paper")
-    still = replace(given, plant=replace(given.plant, w=np.zeros((2, 2))))
+    case = problem("paper")
+    still = replace(case, plant=replace(case.plant, w=np.zeros((2, 2))))
     answer = ConditionedSolver(still, LINK, ALLOWED).solve(0, PAPER_START, still.target)
     assert not answer.backoff_x.any()
     assert answer.slack == 0.0
 
 
 def test_without_limits_it_is_the_regulator() -> None:
-    given = unlimited(problem("paper"))
-    answer = ConditionedSolver(given, LINK, ALLOWED).solve(3, PAPER_START, given.target)
-    law = lqr(given.plant, given.q_x, given.q_u)
-    assert answer.inputs == pytest.approx((answer.states[:-1] - given.target) @ law.k.T + given.u_target)
+    case = unlimited(problem("paper"))
+    answer = ConditionedSolver(case, LINK, ALLOWED).solve(3, PAPER_START, case.target)
+    law = lqr(case.plant, case.q_x, case.q_u)
+    assert answer.inputs == pytest.approx((answer.states[:-1] - case.target) @ law.k.T + case.u_target)
     assert answer.iterations == 0
-    assert answer.cost == pytest.approx((PAPER_START - given.target) @ law.p @ (PAPER_START - given.target))
+    assert answer.cost == pytest.approx((PAPER_START - case.target) @ law.p @ (PAPER_START - case.target))
 
 
-def test_the_reference_is_as_near_to_a_wall_as_it_may_rest() -> None:
-    given = problem("paper")
-    solver = ConditionedSolver(given, LINK, ALLOWED)
+def test_the_reference_is_at_the_rest_distance_from_a_wall() -> None:
+    case = problem("paper")
+    solver = ConditionedSolver(case, LINK, ALLOWED)
     near, far = (solver.solve(0, PAPER_START, np.array([0.0, 0.0, y, 0.0])) for y in (15.0, 40.0))
     assert near.reference == pytest.approx([0.0, 0.0, 15.0, 0.0])
     assert near.offset == 0.0
@@ -312,43 +312,43 @@ def test_the_reference_is_as_near_to_a_wall_as_it_may_rest() -> None:
     assert both[2] < far.reference[2]  # two walls share the risk
 
 
-def test_numbers_that_are_none_get_no_plan() -> None:
-    given = problem("paper")
-    solver = ConditionedSolver(given, LINK, ALLOWED)
+def test_numbers_that_are_not_finite_get_no_plan() -> None:
+    case = problem("paper")
+    solver = ConditionedSolver(case, LINK, ALLOWED)
     for x, preview in ((PAPER_START * np.nan, NOMINAL), (PAPER_START, Preview(cov=np.full((4, 4), np.nan)))):
-        answer = solver.solve(4, x, given.target, preview)
+        answer = solver.solve(4, x, case.target, preview)
         assert (answer.seq, answer.status) == (4, SolveStatus.FAILED)
 
 
-def test_the_same_question_gives_the_same_bits_whatever_was_asked_before() -> None:
-    given, rng = problem("room-hahn-stursberg"), np.random.default_rng(3)
-    questions = [(*somewhere(given, rng), draw_preview("sent", given, rng)) for _ in range(8)]
-    first, second = (ConditionedSolver(given, LINK, ALLOWED, slew_mps3=2.5) for _ in range(2))
+def test_the_same_question_gives_the_same_bits_after_any_other_questions() -> None:
+    case, rng = problem("room-hahn-stursberg"), np.random.default_rng(3)
+    questions = [(*somewhere(case, rng), draw_preview("sent", case, rng)) for _ in range(8)]
+    first, second = (ConditionedSolver(case, LINK, ALLOWED, slew_mps3=2.5) for _ in range(2))
     forth = [first.solve(0, *question).inputs for question in questions]
     back = [second.solve(0, *question).inputs for question in reversed(questions)]
-    for one, other in zip(forth, reversed(back), strict=True):
-        assert one.tobytes() == other.tobytes()
+    for item, other in zip(forth, reversed(back), strict=True):
+        assert item.tobytes() == other.tobytes()
 
 
 # The promise, against chance: the worst step of many runs
 
 
-def pilot(given: ControlProblem, loss: float) -> BatchSmpc:
-    solver = ConditionedSolver(given, bernoulli(np.array([1.0 - loss])), ALLOWED)
-    return BatchSmpc(ConditionedDecider(solver, given.target), given.plant, given.horizon, given.horizon, 0.5)
+def pilot(case: ControlProblem, loss: float) -> BatchSmpc:
+    solver = ConditionedSolver(case, bernoulli(np.array([1.0 - loss])), ALLOWED)
+    return BatchSmpc(ConditionedDecider(solver, case.target), case.plant, case.horizon, case.horizon, 0.5)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("loss", "target"), [(0.3, (0.0, 0.0)), (0.3, (0.0, 18.0)), (0.6, (47.0, 18.0)), (0.1, (49.0, 19.0))]
 )
-def test_no_step_is_outside_more_often_than_promised(loss: float, target: tuple[float, float]) -> None:
+def test_no_step_is_outside_more_often_than_allowed(loss: float, target: tuple[float, float]) -> None:
     runs, steps = 300, 40
     at = np.array([target[0], 0.0, target[1], 0.0])
-    given = replace(problem("paper"), target=at, horizon=24)
-    newest, disturbances = arrivals(runs, steps, loss, 11), noise(given, runs, steps, 12)
-    controller = pilot(given, loss)
-    end = flown(given, controller, PAPER_START, newest, disturbances)
+    case = replace(problem("paper"), target=at, horizon=24)
+    newest, disturbances = arrivals(runs, steps, loss, 11), noise(case, runs, steps, 12)
+    controller = pilot(case, loss)
+    end = flown(case, controller, PAPER_START, newest, disturbances)
     assert not end.failed.any()
     outside = end.state_violated.sum(axis=0)
     assert binomtest(int(outside.max()), runs, ALLOWED, alternative="greater").pvalue > 0.05 / steps
@@ -361,11 +361,11 @@ def test_no_step_is_outside_more_often_than_promised(loss: float, target: tuple[
 
 
 @pytest.mark.slow
-def test_it_spends_what_a_margin_as_cautious_as_the_printed_design_leaves_unused() -> None:
+def test_the_allowed_risk_is_used_where_the_printed_margin_leaves_it() -> None:
     """On common draws, from the paper's start; a margin tuned to the same violations costs as little as this does."""
-    given = problem("paper")
-    newest, disturbances = arrivals(200, 50, LOSS, 21), noise(given, 200, 50, 22)
-    mine = flown(given, pilot(given, LOSS), PAPER_START, newest, disturbances)
-    margin = flown(given, PacketisedPredictive(given, 3.4), PAPER_START, newest, disturbances)
+    case = problem("paper")
+    newest, disturbances = arrivals(200, 50, LOSS, 21), noise(case, 200, 50, 22)
+    mine = flown(case, pilot(case, LOSS), PAPER_START, newest, disturbances)
+    margin = flown(case, PacketisedPredictive(case, 3.4), PAPER_START, newest, disturbances)
     saved = margin.cost.sum(axis=1) - mine.cost.sum(axis=1)
     assert saved.mean() > 6.0 * saved.std() / np.sqrt(len(saved))

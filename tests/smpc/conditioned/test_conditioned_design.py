@@ -1,4 +1,4 @@
-"""Scheme `age-conditioned` without the other one's design: its own name, figures and start, from flight to replay."""
+"""Scheme `age-conditioned` without a design of the other scheme: id, figures and start, from flight to replay."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ QUICK = [SCHEME, "plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "
 
 @pytest.fixture
 def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever makes a design of scheme `hahn-stursberg` fails."""
+    """Making a design of scheme `hahn-stursberg` fails."""
 
     def refuse(*_: object) -> None:
         raise AssertionError("nothing of scheme `age-conditioned` asks for this")
 
-    for name in ("design.make_design", "design.design_record", "design.assembled", "exact.check_schedule"):
+    for name in ("design.make_design", "design.design_record", "design.assemble_design", "exact.check_schedule"):
         monkeypatch.setattr(f"uavctl.smpc.hahn_stursberg.{name}", refuse)
-    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.exact.with_late", refuse)
+    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.exact.add_late_designs", refuse)
     monkeypatch.setattr("uavctl.build.controller.build_rest_limits", refuse)
 
 
@@ -51,19 +51,19 @@ def quick(folder: Path) -> str:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_no_other_design", "no_page")
-def test_a_flight_is_flown_replayed_reported_and_told_otherwise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, flight = quick(tmp_path), str(tmp_path / "flight.mcap")
     assert main(["design", "--config", config, "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert main(["loopback", "--config", config, "--duration", "5", "--out", str(tmp_path), "--json"]) == 0
     flown = json.loads(capsys.readouterr().out)
     assert flown["steps"] > 80
-    told = header(Path(flight))
-    assert told.design_id == figures["design_id"] == told.design["design_id"]
-    assert {key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")} == told.design
-    assert read_design(told).horizon == 48
+    reported = header(Path(flight))
+    assert reported.design_id == figures["design_id"] == reported.design["design_id"]
+    assert {
+        key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")
+    } == reported.design
+    assert read_design(reported).horizon == 48
     assert main(["log", "replay", flight, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"]
     assert main(["log", "report", flight, "--json"]) == 0
@@ -97,7 +97,7 @@ def test_a_link_that_no_horizon_bridges_is_refused_by_the_scheme_s_own_error(
     assert "smpc.horizon: positions are 12 steps old or more in 0.282 of all steps" in capsys.readouterr().err
 
 
-def test_the_name_is_of_what_the_answers_depend_on() -> None:
+def test_the_id_hashes_all_that_answers_depend_on() -> None:
     def name(*overrides: str) -> str:
         return build_flight_design(load_config("room-hahn-stursberg", [SCHEME, *overrides])).design_id
 
@@ -108,7 +108,7 @@ def test_the_name_is_of_what_the_answers_depend_on() -> None:
         "smpc.k_tau=[[1.0]]",
         "daemon.tick_s=0.1",
     ]
-    assert {name(one) for one in same} == {name()}
+    assert {name(item) for item in same} == {name()}
     others = [
         "link.loss=0.2", "link.model=gilbert-elliott", "smpc.delta_x=0.9", "smpc.horizon=13", "cost.input=[1,1,1]",
         "sets.input_upper=[2,2,2]", "plant.wind_std_mps2=[0.1,0.1,0.1]", "smpc.slack_linear=1e4", "source.rate_hz=20",
@@ -117,13 +117,13 @@ def test_the_name_is_of_what_the_answers_depend_on() -> None:
     assert len({name(), *map(name, others)}) == len(others) + 1
 
 
-def test_the_solver_that_says_where_to_rest_is_the_one_that_flies() -> None:
+def test_the_solver_of_rest_limits_is_the_one_that_flies() -> None:
     config = load_config("room-hahn-stursberg", [SCHEME])
     design = build_conditioned(config)
-    assert compute_rest_limits(design) is design.rests
-    assert msgspec.json.decode(msgspec.json.encode(make_design_record(design)))["rests"] == design.rests.tolist()
+    assert compute_rest_limits(design) is design.rest_limits
+    assert msgspec.json.decode(msgspec.json.encode(make_design_record(design)))["rests"] == design.rest_limits.tolist()
     exact = build_conditioned(config, for_flight=False, cov=np.zeros((9, 9)))
-    assert (exact.rests >= design.rests).all() and (exact.rests > design.rests).any()
+    assert (exact.rest_limits >= design.rest_limits).all() and (exact.rest_limits > design.rest_limits).any()
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_the_solver_that_says_where_to_rest_is_the_one_that_flies() -> None:
 def test_a_recording_under_the_name_of_the_other_design_replays(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As they were made before the scheme had a design of its own."""
+    """Recordings from before the scheme had its own design."""
     assert main([*FLOWN, "--duration", "3", "--out", str(tmp_path)]) == 0
     old = tmp_path / "old.mcap"
     recorder = SyncRecorder(old, load_config("room-hahn-stursberg").log)

@@ -1,4 +1,4 @@
-"""What a plan counts as unknown, with the bias that the flight's filter estimates: against chance, and in flight."""
+"""Deviations of a plan, with the bias of the flight's filter: against simulations, and in flight."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ from uavctl.smpc.nominal import find_parts
 DRIFT = 0.3
 
 
-def test_a_bias_that_is_unknown_and_drifts_is_what_chance_makes_of_it() -> None:
-    given, rng, draws = problem("room-hahn-stursberg"), np.random.default_rng(3), 40_000
-    given = replace(given, horizon=6)
-    seen = add_bias(given.plant, DRIFT, force=True)
-    root = 0.05 * rng.normal(size=(seen.n_x, seen.n_x))
-    sigma = Deviations(given, find_parts(given), seen).of(root @ root.T)
+def test_deviations_with_a_drifting_bias_match_a_simulation() -> None:
+    case, rng, draws = problem("room-hahn-stursberg"), np.random.default_rng(3), 40_000
+    case = replace(case, horizon=6)
+    filter_plant = add_bias(case.plant, DRIFT, force=True)
+    root = 0.05 * rng.normal(size=(filter_plant.n_x, filter_plant.n_x))
+    sigma = Deviations(case, find_parts(case), filter_plant).compute(root @ root.T)
     # One by one, each axis in its own group of states: what another axis has to do with it is nothing to a row.
-    error = rng.normal(size=(draws, seen.n_x)) @ root.T
-    noise = np.linalg.cholesky(seen.w)
-    columns = np.concatenate([part.rows_x for part in find_parts(given)])
-    for stage in range(given.horizon):
-        error = error @ seen.a.T + rng.normal(size=(draws, seen.n_w)) @ noise.T @ seen.e.T
-        drawn = (error[:, : given.plant.n_x] @ given.state_set.c[columns].T).std(axis=0)
+    error = rng.normal(size=(draws, filter_plant.n_x)) @ root.T
+    noise = np.linalg.cholesky(filter_plant.w)
+    columns = np.concatenate([part.rows_x for part in find_parts(case)])
+    for stage in range(case.horizon):
+        error = error @ filter_plant.a.T + rng.normal(size=(draws, filter_plant.n_w)) @ noise.T @ filter_plant.e.T
+        drawn = (error[:, : case.plant.n_x] @ case.state_set.c[columns].T).std(axis=0)
         np.testing.assert_allclose(sigma[stage], drawn, rtol=5.0 / np.sqrt(2.0 * draws))
 
 
-def test_without_a_bias_it_is_the_plant_s_own() -> None:
-    given = problem("room-hahn-stursberg")
-    cov = np.diag(np.linspace(0.01, 0.09, given.plant.n_x))
-    alone = Deviations(given, find_parts(given), given.plant).of(cov)
-    seen = add_bias(given.plant, 1e-9)
-    known = np.zeros((seen.n_x, seen.n_x))
-    known[: given.plant.n_x, : given.plant.n_x] = cov
-    np.testing.assert_allclose(Deviations(given, find_parts(given), seen).of(known), alone, rtol=1e-9)
+def test_without_a_bias_deviations_are_the_plant_s() -> None:
+    case = problem("room-hahn-stursberg")
+    cov = np.diag(np.linspace(0.01, 0.09, case.plant.n_x))
+    single = Deviations(case, find_parts(case), case.plant).compute(cov)
+    filter_plant = add_bias(case.plant, 1e-9)
+    known = np.zeros((filter_plant.n_x, filter_plant.n_x))
+    known[: case.plant.n_x, : case.plant.n_x] = cov
+    np.testing.assert_allclose(Deviations(case, find_parts(case), filter_plant).compute(known), single, rtol=1e-9)
 
 
 def test_a_filter_settles_at_the_riccati_solution() -> None:
     """With positions alone, against the filter in innovations form, which is another implementation."""
     config = load_config("room-hahn-stursberg")
     plant, estimator, dt_ns = build_problem(config).plant, build_estimator(config), 200_000_000
-    found = settle_covariance(make_kalman(plant, estimator, dt_ns), dt_ns, 70_000_000, 0)
+    result = settle_covariance(make_kalman(plant, estimator, dt_ns), dt_ns, 70_000_000, 0)
     form = innovation_form(plant, estimator.position_std_m, 0.07, 0, estimator.bias_drift)
-    np.testing.assert_allclose(found[: plant.n_x, : plant.n_x], form.estimate_cov, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(result[: plant.n_x, : plant.n_x], form.estimate_cov, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
-def test_a_design_rests_on_what_the_flight_s_filter_does_not_know(preset: str) -> None:
+def test_a_design_uses_the_covariance_of_the_flight_s_filter(preset: str) -> None:
     config = load_config(preset)
     controller, design = build_controller(config), build_conditioned(config)
     kalman = controller.kalman

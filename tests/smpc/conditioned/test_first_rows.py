@@ -1,4 +1,4 @@
-"""Which rows a program begins with changes how long it takes, and not what comes out."""
+"""First active rows change the number of iterations, not the result."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.qp import FirstRows
 
 
-def asked(name: str) -> list[Answer]:
+def requested(name: str) -> list[Answer]:
     """Answers to states from anywhere, of which most are on their way out faster than inputs can brake."""
     solver = build_controller(load_config(name)).solver
     assert isinstance(solver, ConditionedSolver)
@@ -22,20 +22,20 @@ def asked(name: str) -> list[Answer]:
 
 @pytest.mark.parametrize("name", ["room-px4", "room-ardupilot"])
 def test_a_guess_saves_iterations_and_changes_no_plan(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    guessed = asked(name)
+    guessed = requested(name)
     monkeypatch.setattr(FirstRows, "is_suitable", lambda *_: False)
-    without = asked(name)
+    without = requested(name)
     compared = 0
-    for one, other in zip(guessed, without, strict=True):
-        assert one.status == other.status
-        if max(one.iterations, other.iterations) > 300:
+    for item, other in zip(guessed, without, strict=True):
+        assert item.status == other.status
+        if max(item.iterations, other.iterations) > 300:
             continue  # one of them may have ended its rounds early
         compared += 1
-        assert one.inputs == pytest.approx(other.inputs, abs=1e-6)
+        assert item.inputs == pytest.approx(other.inputs, abs=1e-6)
         # Slacks are as exact as their size: these are states that inputs cannot brake, metres past their limits.
-        assert one.slack == pytest.approx(other.slack, rel=1e-7, abs=1e-6)
+        assert item.slack == pytest.approx(other.slack, rel=1e-7, abs=1e-6)
     assert compared > 20
-    assert sum(one.iterations for one in guessed) < 0.8 * sum(one.iterations for one in without)
+    assert sum(item.iterations for item in guessed) < 0.8 * sum(item.iterations for item in without)
 
 
 def chain(steps: int, lag: float) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +45,7 @@ def chain(steps: int, lag: float) -> tuple[np.ndarray, np.ndarray]:
     return states, np.stack([inputs, inputs - np.eye(steps, k=-1)], axis=1)
 
 
-def test_where_the_fastest_brake_leaves_a_row_it_gives_way() -> None:
+def test_a_row_that_the_fastest_brake_leaves_is_relaxed() -> None:
     steps = 6
     of_x, of_u = chain(steps, 0.5)
     first = FirstRows(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))

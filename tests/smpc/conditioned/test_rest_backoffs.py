@@ -1,4 +1,4 @@
-"""What plans that rest keep from a limit: against draws of what new plans begin from, and in closed loop."""
+"""Distances of resting plans from a limit: against drawn starts of new plans, and in closed loop."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.tasks import Cell, make_tasks
-from uavctl.smpc.conditioned.backoffs import SLACK, age_risk, quantile, rest_backoffs
+from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, compute_rest_backoffs, quantile, spread_risk
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.estimate import innovation_form
@@ -29,72 +29,74 @@ def steps_for(loss: float) -> int:
 
 
 def distances(link: AgeModel, steps: int, cov: Array | None = None, slew_mps3: float = np.inf, most: int = 1) -> Array:
-    given = replace(problem("paper"), horizon=steps)
-    deviations = np.sqrt([EAST[0] @ one @ EAST[0] for one in propagate_covariance(given.plant, steps)[1:]])
-    risk = age_risk(link, deviations, ALLOWED, corner=2)
-    slew = SlewRows(given.plant, given.input_set, slew_mps3)
-    return rest_backoffs(given, risk, ALLOWED, slew, EAST, cov, most)
+    case = replace(problem("paper"), horizon=steps)
+    deviations = np.sqrt([EAST[0] @ item @ EAST[0] for item in propagate_covariance(case.plant, steps)[1:]])
+    risk = spread_risk(link, deviations, ALLOWED, corner=2)
+    slew = SlewRows(case.plant, case.input_set, slew_mps3)
+    return compute_rest_backoffs(case, risk, ALLOWED, slew, EAST, cov, most)
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.6, 0.9])
 @pytest.mark.parametrize("noisy", [False, True])
-def test_the_share_of_new_plans_that_need_slack_is_the_one_it_is_made_for(loss: float, noisy: bool) -> None:
-    """Gaps, news and a full brake are drawn and flown one by one, and each stage is held against its back-off."""
+def test_the_share_of_new_plans_with_slack_is_the_design_share(loss: float, noisy: bool) -> None:
+    """Gaps, positions and a full brake are drawn and simulated, and each stage is compared with its back-off."""
     steps, rng, draws = steps_for(loss), np.random.default_rng(8), 40_000
-    given = replace(problem("paper"), horizon=steps)
-    plant = given.plant
+    case = replace(problem("paper"), horizon=steps)
+    plant = case.plant
     cov = innovation_form(plant, 0.1, 0.0, 0).estimate_cov if noisy else np.zeros((4, 4))
     (d,) = distances(bernoulli(np.array([1.0 - loss])), steps, cov)[0]
-    risk = age_risk(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
+    risk = spread_risk(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
     backoff = quantile(risk.shares) * sigma(steps, cov)
     gap = np.minimum(rng.geometric(1.0 - loss, draws), steps)
     spread = propagate_covariance(plant, steps, cov) - cov
     state = np.zeros((draws, 4))
     for t in np.unique(gap):
         values, vectors = np.linalg.eigh(spread[t])
-        own = gap == t
-        state[own] = (rng.normal(size=(own.sum(), 4)) * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+        selected = gap == t
+        state[selected] = (rng.normal(size=(selected.sum(), 4)) * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     room = np.maximum(d, backoff[gap - 1])
     over = np.zeros(draws, dtype=bool)
     for s in range(steps):
-        state = state @ plant.a.T + np.array([0.0, given.input_set.bounds[0][1]]) @ plant.b.T
+        state = state @ plant.a.T + np.array([0.0, case.input_set.bounds[0][1]]) @ plant.b.T
         over |= state[:, 2] > room - backoff[s]
     share = over.mean()
     error = 5.0 * np.sqrt(share / draws)
     resting = float(risk.weights @ norm.cdf(-d / sigma(steps, cov)))
-    if resting < 0.99 * (ALLOWED - risk.beyond):  # it is the slack that asks for the distance
+    if resting < 0.99 * (ALLOWED - risk.older_probability):  # it is the slack that asks for the distance
         # Stages together leave more often than the worst of each gap alone, by a little.
-        assert SLACK * ALLOWED - error < share < 1.15 * SLACK * ALLOWED + error
+        assert SLACK_SHARE * ALLOWED - error < share < 1.15 * SLACK_SHARE * ALLOWED + error
     else:
-        assert resting == pytest.approx(ALLOWED - risk.beyond, rel=1e-6)
-        assert share < SLACK * ALLOWED + error
+        assert resting == pytest.approx(ALLOWED - risk.older_probability, rel=1e-6)
+        assert share < SLACK_SHARE * ALLOWED + error
 
 
 def sigma(steps: int, cov: Array) -> Array:
     """Deviations (H,) of the row in the stages of a plan."""
-    return np.sqrt([EAST[0] @ one @ EAST[0] for one in propagate_covariance(problem("paper").plant, steps, cov)[1:]])
+    return np.sqrt([EAST[0] @ item @ EAST[0] for item in propagate_covariance(problem("paper").plant, steps, cov)[1:]])
 
 
-def test_in_bursts_it_is_where_resting_at_all_ages_is_outside_as_often_as_allowed() -> None:
+def test_in_bursts_rest_at_all_ages_is_outside_as_often_as_allowed() -> None:
     link = gilbert_elliott(enter=1.0 / 7.0, leave=1.0 / 3.0, good_loss=0.0, bad_loss=1.0)
     (d,) = distances(link, 20)[0]
-    risk = age_risk(link, sigma(20, np.zeros((4, 4))), ALLOWED, corner=2)
-    assert risk.weights @ norm.cdf(-d / sigma(20, np.zeros((4, 4)))) == pytest.approx(ALLOWED - risk.beyond, rel=1e-6)
+    risk = spread_risk(link, sigma(20, np.zeros((4, 4))), ALLOWED, corner=2)
+    assert risk.weights @ norm.cdf(-d / sigma(20, np.zeros((4, 4)))) == pytest.approx(
+        ALLOWED - risk.older_probability, rel=1e-6
+    )
 
 
-def test_sharing_an_error_of_the_estimate_and_a_slow_gate_ask_for_more() -> None:
+def test_sharing_estimate_errors_and_a_slow_gate_need_more_distance() -> None:
     link, plant = bernoulli(np.array([0.7])), problem("paper").plant
-    (alone,), (shared,) = distances(link, 16, most=2)
+    (single,), (shared,) = distances(link, 16, most=2)
     (unsure,) = distances(link, 16, innovation_form(plant, 0.1, 0.0, 0).estimate_cov)[0]
     (slow,) = distances(link, 16, slew_mps3=0.9)[0]
-    assert shared > alone + 0.3
-    assert unsure > alone + 0.2
-    assert slow > alone + 0.1
+    assert shared > single + 0.3
+    assert unsure > single + 0.2
+    assert slow > single + 0.1
 
 
 def test_late_positions_are_counted_from_their_capture() -> None:
-    """Positions that are always a step late: a plan begins with what one shows of a step before."""
-    given = problem("paper")
+    """With positions always a step late, a plan starts from the state of the step before."""
+    case = problem("paper")
 
     class Late:
         """A link on which every position is known one step later; 30 % are lost."""
@@ -105,42 +107,42 @@ def test_late_positions_are_counted_from_their_capture() -> None:
         def outage(self, age: int) -> float:
             return self._on_time.outage(age - 1) if age else 1.0
 
-    risk = age_risk(Late(), sigma(given.horizon, np.zeros((4, 4))), ALLOWED, corner=2)
-    late = rest_backoffs(given, risk, ALLOWED, SlewRows(given.plant, given.input_set, np.inf), EAST, None, 1)[0, 0]
-    on_time = distances(bernoulli(np.array([0.7])), given.horizon)[0, 0]
+    risk = spread_risk(Late(), sigma(case.horizon, np.zeros((4, 4))), ALLOWED, corner=2)
+    late = compute_rest_backoffs(case, risk, ALLOWED, SlewRows(case.plant, case.input_set, np.inf), EAST, None, 1)[0, 0]
+    on_time = distances(bernoulli(np.array([0.7])), case.horizon)[0, 0]
     assert on_time + 0.5 < late < on_time + 3.0
 
 
-def test_both_sides_of_a_box_are_alike_and_nothing_disturbed_needs_nothing() -> None:
-    given = problem("paper")
-    solver = ConditionedSolver(given, bernoulli(np.array([0.7])), ALLOWED)
-    positions = np.any(given.state_set.c[:, [0, 2]] != 0.0, axis=1)
-    kept = (given.state_set.b - solver.rests())[positions]
+def test_both_sides_of_a_box_are_equal_and_undisturbed_rows_need_no_distance() -> None:
+    case = problem("paper")
+    solver = ConditionedSolver(case, bernoulli(np.array([0.7])), ALLOWED)
+    positions = np.any(case.state_set.c[:, [0, 2]] != 0.0, axis=1)
+    kept = (case.state_set.b - solver.rest_limits())[positions]
     assert kept == pytest.approx(kept[0], rel=1e-9) and kept[0] > 1.0
-    still = replace(given, plant=replace(given.plant, w=np.zeros((2, 2))))
+    still = replace(case, plant=replace(case.plant, w=np.zeros((2, 2))))
     calm = ConditionedSolver(still, bernoulli(np.array([0.7])), ALLOWED)
-    assert calm.rests() == pytest.approx(given.state_set.b)
+    assert calm.rest_limits() == pytest.approx(case.state_set.b)
 
 
 CORNER = 'set = ["target.position_m=[49, 19, 0]"]\nruns = 300\nsteps = 50\nstart = [46, 0, 17, 0]\n'
 
 
 def corner(tmp_path: Path, loss: float, steps: int) -> Cell:
-    ours = rig.controller("smpc", f'set = ["smpc.scheme=age-conditioned", "smpc.horizon={steps}"]')
-    (made,) = rig.cells(tmp_path, CORNER, ours, rig.table("link", "lossy", f'set = ["link.loss={loss}"]'))
+    outcome = rig.controller("smpc", f'set = ["smpc.scheme=age-conditioned", "smpc.horizon={steps}"]')
+    (made,) = rig.cells(tmp_path, CORNER, outcome, rig.table("link", "lossy", f'set = ["link.loss={loss}"]'))
     return made
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("loss", "steps"), [(0.1, 12), (0.8, 32), (0.9, 56)])
-def test_a_corner_uses_half_of_the_allowance_and_no_more_than_it(tmp_path: Path, loss: float, steps: int) -> None:
+def test_a_corner_uses_at_least_half_of_the_allowed_risk(tmp_path: Path, loss: float, steps: int) -> None:
     """Settled steps outside, by their mean over runs and four of its standard errors; and plans with slack."""
     (task,) = make_tasks([corner(tmp_path, loss, steps)])
-    found = task.fly()
-    assert not any(found["error"])
-    rate = np.asarray(found["outside"])[:, 25:].mean(axis=1)
+    result = task.fly()
+    assert not any(result["error"])
+    rate = np.asarray(result["outside"])[:, 25:].mean(axis=1)
     error = 4.0 * rate.std() / np.sqrt(len(rate))
     assert rate.mean() - error < ALLOWED
     assert rate.mean() + error > 0.5 * ALLOWED
     assert rate.mean() > 0.4 * ALLOWED
-    assert found["slack_used"].sum() < ALLOWED * found["decisions"].sum()
+    assert result["slack_used"].sum() < ALLOWED * result["decisions"].sum()

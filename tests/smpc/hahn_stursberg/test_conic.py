@@ -1,4 +1,4 @@
-"""The exact program: the paper's numbers, every constraint evaluated independently, and the life beyond (19)."""
+"""The exact program: the paper's numbers, each constraint evaluated independently, and the extensions of (19)."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_one_axis_has_36_variables_besides_reference_slacks_and_backoffs(paper_d
 def test_agrees_with_the_printed_problem_on_100_feasible_states_of_an_axis(
     paper_design: Design, paper_solver: ConicSolver
 ) -> None:
-    """50 states of the plane: the axes are problems of their own."""
+    """50 states of the plane: the axes are independent problems."""
     rng = np.random.default_rng(4)
     problems = [PrintedProblem(paper_design, component) for component in decompose(paper_design)]
     feasible, worst = 0, 0.0
@@ -101,13 +101,13 @@ def test_agrees_with_the_printed_problem_on_100_feasible_states_of_an_axis(
 def test_infeasible_where_the_printed_problem_is(paper_design: Design, paper_solver: ConicSolver) -> None:
     printed = PrintedSolver(paper_design)
     rng = np.random.default_rng(5)
-    seen = set()
+    observed = set()
     for x in rng.uniform(PAPER_LOWER, PAPER_UPPER, size=(12, 4)):
         hard = is_hard(paper_solver.solve(0, x, ORIGIN))
         status = printed.solve(0, x, ORIGIN).status
         assert status is (SolveStatus.OPTIMAL if hard else SolveStatus.INFEASIBLE)
-        seen.add(hard)
-    assert seen == {True, False}
+        observed.add(hard)
+    assert observed == {True, False}
 
 
 def test_coupled_axes_are_one_program_and_agree_with_the_joint_printed_problem() -> None:
@@ -136,7 +136,7 @@ def independent_rows(design: Design, solver: ConicSolver, x: Array, target: Arra
     answer = solver.solve(0, x, target)
     gain = np.zeros((H, plant.n_u, H, plant.n_w))
     for part in solver._parts:
-        where, program = part.component, part._exact
+        where, program = part.component, part._hard
         here = x[where.states], target[where.states]
         theta = program.conic.solve(program.parameters(*here)).variables[program.layout.theta]
         for value, (t, r, i, j) in zip(theta, program.horizon.gains, strict=True):
@@ -148,44 +148,44 @@ def independent_rows(design: Design, solver: ConicSolver, x: Array, target: Arra
         mean.append(plant.a @ mean[-1] + plant.b @ answer.inputs[t])
         effect.append(plant.a @ effect[-1] + plant.b @ gain[t].reshape(plant.n_u, -1) + enter.reshape(plant.n_x, -1))
     noise = np.kron(np.eye(H), plant.w)
-    least = {"state": np.inf, "input": np.inf, "limit": np.inf}
+    minimum = {"state": np.inf, "input": np.inf, "limit": np.inf}
     for t in range(1, H + 1):
         sigma = effect[t] @ noise @ effect[t].T
         for i, (c, b) in enumerate(zip(design.state_set.c, design.state_set.b, strict=True)):
             backoff = design.kappa_x[t] * np.sqrt(c @ sigma @ c)
             assert answer.backoff_x[t, i] == pytest.approx(backoff, rel=1e-6, abs=1e-9)
-            least["state"] = min(least["state"], b - c @ mean[t] - backoff)
+            minimum["state"] = min(minimum["state"], b - c @ mean[t] - backoff)
     for t in range(H):
         m = gain[t].reshape(plant.n_u, -1)
         for i, (c, b) in enumerate(zip(design.input_set.c, design.input_set.b, strict=True)):
             backoff = design.kappa_u[t] * np.sqrt(c @ m @ noise @ m.T @ c)
             assert answer.backoff_u[t, i] == pytest.approx(backoff, rel=1e-6, abs=1e-9)
-            least["input"] = min(least["input"], b - c @ answer.inputs[t] - backoff)
-            least["limit"] = min(least["limit"], b - c @ answer.inputs[t])
+            minimum["input"] = min(minimum["input"], b - c @ answer.inputs[t] - backoff)
+            minimum["limit"] = min(minimum["limit"], b - c @ answer.inputs[t])
     xi = np.vstack(effect[H - tau :])
-    least["lmi"] = float(np.linalg.eigvalsh(design.terminal.sigma_xi - xi @ noise @ xi.T)[0])
-    least["terminal"] = -float(np.abs(np.array(mean[H - tau :]) - answer.reference).max())
+    minimum["lmi"] = float(np.linalg.eigvalsh(design.terminal.sigma_xi - xi @ noise @ xi.T)[0])
+    minimum["terminal"] = -float(np.abs(np.array(mean[H - tau :]) - answer.reference).max())
     assert answer.states == pytest.approx(np.array(mean), abs=1e-12)
-    return least
+    return minimum
 
 
 @pytest.mark.parametrize("x", [START, [-25.0, 3.0, 10.0, 6.0], [5.0, -6.0, 1.0, -2.0]], ids=str)
 def test_solution_keeps_every_row_of_the_printed_problem(
     paper_design: Design, paper_solver: ConicSolver, x: list[float]
 ) -> None:
-    least = independent_rows(paper_design, paper_solver, np.array(x), ORIGIN)
-    assert least.pop("limit") >= 0.0
-    assert {row: margin for row, margin in least.items() if margin < -1e-6} == {}
+    minimum = independent_rows(paper_design, paper_solver, np.array(x), ORIGIN)
+    assert minimum.pop("limit") >= 0.0
+    assert {row: margin for row, margin in minimum.items() if margin < -1e-6} == {}
 
 
 def test_rows_are_kept_by_a_coupled_plant_and_in_a_room(room_solver: ConicSolver) -> None:
     cross, box = coupled(), room()
     near = ROOM_TARGET + np.array([-0.3, 0, 0, 0.2, 0, 0, 0.1, 0, 0])
-    for least in (
+    for minimum in (
         independent_rows(cross, ConicSolver(cross), np.array([4.0, -1.0, -3.0, 0.5]), ORIGIN),
         independent_rows(box, room_solver, near, ROOM_TARGET),
     ):
-        assert {row: margin for row, margin in least.items() if margin < -1e-6} == {}
+        assert {row: margin for row, margin in minimum.items() if margin < -1e-6} == {}
 
 
 def test_far_target_gives_a_reference_in_between(paper_solver: ConicSolver) -> None:
@@ -207,7 +207,7 @@ def test_plan_depends_on_the_difference_to_the_target_only() -> None:
     assert there.cost == pytest.approx(here.cost, rel=1e-8)
 
 
-def test_start_outside_the_limits_uses_slack_and_says_so(paper_solver: ConicSolver) -> None:
+def test_a_start_outside_the_limits_uses_slack_and_reports_it(paper_solver: ConicSolver) -> None:
     answer = paper_solver.solve(0, np.array([0.0, 14.0, 0.0, 0.0]), ORIGIN)
     assert answer.status is SolveStatus.OPTIMAL
     assert answer.slack > 0.1
@@ -215,7 +215,7 @@ def test_start_outside_the_limits_uses_slack_and_says_so(paper_solver: ConicSolv
     assert 0.0 < worst <= answer.slack + 1e-6
 
 
-def test_where_no_equilibrium_is_in_reach_the_terminal_equality_gives_way(paper_solver: ConicSolver) -> None:
+def test_without_a_reachable_equilibrium_the_terminal_equality_is_relaxed(paper_solver: ConicSolver) -> None:
     for x in ([80.0, 60.0, 0.0, 0.0], [500.0, -100.0, -900.0, 40.0], [-3e3, 200.0, 2e3, 0.0]):
         answer = paper_solver.solve(0, np.array(x), ORIGIN)
         assert answer.status is SolveStatus.OPTIMAL
@@ -225,8 +225,8 @@ def test_where_no_equilibrium_is_in_reach_the_terminal_equality_gives_way(paper_
         assert answer.terminal_miss == pytest.approx(miss, rel=1e-6)
 
 
-def test_same_question_same_bits_whatever_came_before(paper_design: Design) -> None:
-    fresh = ConicSolver(paper_design).solve(0, START, ORIGIN)
+def test_same_question_same_bits_after_any_other_questions(paper_design: Design) -> None:
+    new = ConicSolver(paper_design).solve(0, START, ORIGIN)
     used = ConicSolver(paper_design)
     rng = np.random.default_rng(6)
     for x in rng.uniform(1.5 * PAPER_LOWER, 1.5 * PAPER_UPPER, size=(20, 4)):
@@ -235,8 +235,8 @@ def test_same_question_same_bits_whatever_came_before(paper_design: Design) -> N
     used.solve(0, np.full(4, np.nan), ORIGIN)
     again = used.solve(0, START, ORIGIN)
     for name in ("inputs", "states", "backoff_x", "backoff_u", "reference"):
-        assert getattr(again, name).tobytes() == getattr(fresh, name).tobytes()
-    assert (again.cost, again.cost_lower, again.iterations) == (fresh.cost, fresh.cost_lower, fresh.iterations)
+        assert getattr(again, name).tobytes() == getattr(new, name).tobytes()
+    assert (again.cost, again.cost_lower, again.iterations) == (new.cost, new.cost_lower, new.iterations)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -248,7 +248,7 @@ def test_numbers_that_are_not_finite_fail_without_a_plan(paper_solver: ConicSolv
 
 
 @pytest.mark.parametrize("scale", [1e8, 1e20, 1e160, 1e300])
-def test_absurd_numbers_fail_without_an_exception(paper_solver: ConicSolver, scale: float) -> None:
+def test_extreme_numbers_fail_without_an_exception(paper_solver: ConicSolver, scale: float) -> None:
     assert paper_solver.solve(0, START * scale, ORIGIN).status is SolveStatus.FAILED
 
 
@@ -263,7 +263,7 @@ def test_a_panic_of_the_solver_is_a_failed_answer(paper_design: Design, monkeypa
     solver = ConicSolver(paper_design)
     expected = solver.solve(0, START, ORIGIN)
     for part in solver._parts:
-        part._exact.conic._solver = part._missing.conic._solver = Panicking()  # type: ignore[assignment]  # a stand-in
+        part._hard.conic._solver = part._soft.conic._solver = Panicking()  # type: ignore[assignment]  # a stand-in
     assert solver.solve(0, START, ORIGIN).status is SolveStatus.FAILED
     assert solver.solve(0, START, ORIGIN).inputs.tobytes() == expected.inputs.tobytes()
 
@@ -274,7 +274,7 @@ def test_iterations_are_bounded() -> None:
     assert answer.iterations == 6
 
 
-def test_every_status_of_the_solver_has_a_meaning_and_only_solved_is_optimal() -> None:
+def test_every_status_of_clarabel_is_mapped_and_only_solved_is_optimal() -> None:
     names = {str(getattr(clarabel.SolverStatus, name)) for name in dir(clarabel.SolverStatus) if name[0] != "_"}
     assert names <= set(conic._STATUS)
     assert [name for name, status in conic._STATUS.items() if status is SolveStatus.OPTIMAL] == ["Solved"]
@@ -283,7 +283,7 @@ def test_every_status_of_the_solver_has_a_meaning_and_only_solved_is_optimal() -
 @pytest.mark.parametrize(
     ("solver_says", "status"), [("AlmostSolved", SolveStatus.INACCURATE), ("NumericalError", SolveStatus.FAILED)]
 )
-def test_other_endings_are_passed_on(
+def test_other_status_values_are_passed_on(
     paper_design: Design, monkeypatch: pytest.MonkeyPatch, solver_says: str, status: SolveStatus
 ) -> None:
     solver = ConicSolver(paper_design)
@@ -298,7 +298,7 @@ def test_other_endings_are_passed_on(
     assert solver.solve(0, START, ORIGIN).status is status
 
 
-def test_inputs_are_cut_back_to_the_limits_and_more_than_a_tolerance_is_told() -> None:
+def test_inputs_are_clipped_and_more_than_a_tolerance_is_reported() -> None:
     box = Polytope.from_box([-7.5, -1.1], [7.5, 1.1])
     wanted = np.array([[7.5 + 1e-9, -1.1 - 3e-10], [0.1, 0.2]])
     cut, kept = clip_inputs(wanted, box.c, box.b)

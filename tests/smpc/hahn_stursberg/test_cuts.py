@@ -1,4 +1,4 @@
-"""A recording that ends anywhere is recovered and replays alike up to there."""
+"""A recording that is cut at any byte is recovered and replays identically up to there."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cuts(tmp_path_factory: pytest.TempPathFactory) -> Cuts:
 
 @pytest.fixture(autouse=True, scope="module")
 def _designed_once(cuts: Cuts) -> Iterator[None]:
-    """All cuts are of one flight, and a flight leaves nothing in its controller: a replay would find out."""
+    """All cuts are of one flight. A flight leaves no state in its controller; a replay would show it."""
 
     @lru_cache
     def flyer(config: Config) -> Prepared:
@@ -41,18 +41,18 @@ def _designed_once(cuts: Cuts) -> Iterator[None]:
 
 
 def all_wrong(cuts: Cuts, places: list[tuple[int, int]]) -> dict[tuple[int, int], str]:
-    found = {}
+    result = {}
     for place in places:
         with tempfile.TemporaryDirectory() as folder:
-            found[place] = cuts.find_problem(Path(folder), *place)
-    return {place: text for place, text in found.items() if text}
+            result[place] = cuts.find_problem(Path(folder), *place)
+    return {place: text for place, text in result.items() if text}
 
 
 def thinned(cuts: Cuts) -> list[tuple[int, int]]:
     """All places around a file's first and last chunk; of the six beside each other chunk, each kind in turn."""
     within = []
     for file in range(len(cuts.files)):
-        chunks = [one for one in cuts.chunks if one.file == file]
+        chunks = [item for item in cuts.chunks if item.file == file]
         within.append(range(chunks[0].indexed + 2, chunks[-1].end - 1))
     # 5 has no factor in common with 6, and is less: no chunk is left out.
     return [(file, size) for i, (file, size) in enumerate(cuts.cut_points()) if i % 5 == 0 or size not in within[file]]
@@ -60,7 +60,7 @@ def thinned(cuts: Cuts) -> list[tuple[int, int]]:
 
 @pytest.mark.slow
 @pytest.mark.fault(52)
-def test_cut_beside_the_end_of_every_chunk(cuts: Cuts) -> None:
+def test_cut_near_the_end_of_every_chunk(cuts: Cuts) -> None:
     assert len(cuts.files) > 1 and len(cuts.chunks) > 8
     assert all_wrong(cuts, thinned(cuts)) == {}
     assert cuts.straddled >= 10  # ticks of which the decision is beyond the cut

@@ -1,4 +1,4 @@
-"""Designs: the presets' figures, risk allocation, search, identity, and what is refused."""
+"""Designs: figures of the presets, risk allocation, search, hash, and refusals."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def test_the_id_follows_every_number() -> None:
     base = make_design(spec("paper"))
     assert make_design(spec("paper")).design_id == base.design_id
     assert len(base.design_id) == 16
-    given = spec("paper")
-    nudged = given.q_x.copy()
+    case = spec("paper")
+    nudged = case.q_x.copy()
     nudged[0, 0] = np.nextafter(nudged[0, 0], 11.0)
     others: list[dict[str, Any]] = [
         {"q_x": nudged},
@@ -99,7 +99,7 @@ def test_the_id_follows_every_number() -> None:
         {"delays": 6},
         {"target_m": (1.0, 0.0, 0.0)},
         {"allocation": "halfspace"},
-        {"plant": replace(given.plant, accel_per_input=np.ones(2))},
+        {"plant": replace(case.plant, accel_per_input=np.ones(2))},
         {"state_set": Polytope.from_box([-30.0, -8.0, -25.0, -8.0], [51.0, 7.0, 20.0, 8.0])},
     ]
     ids = {make_design(spec("paper", **changes)).design_id for changes in others}
@@ -112,8 +112,8 @@ def test_search_takes_the_least_mean_cost() -> None:
     def cost_of(design: Design, state: Array) -> float:
         tried.append(design.schedule.delays)
         # least for r̂ = (-1 -1 -1 -1 0 0 1 2), on the mean of two states that want different things
-        wanted = np.array([1, 2, 3, 4, 4, 5, 5, 5, 5, 5, 5, 5])
-        return float(np.abs(np.array(design.schedule.delays) - wanted).sum() + state[0])
+        expected = np.array([1, 2, 3, 4, 4, 5, 5, 5, 5, 5, 5, 5])
+        return float(np.abs(np.array(design.schedule.delays) - expected).sum() + state[0])
 
     design = make_design(spec("paper", rule="search", search_states=STATES), cost_of)
     assert design.schedule.delays == (1, 2, 3, 4, 4, 5, 5, 5, 5, 5, 5, 5)
@@ -121,7 +121,7 @@ def test_search_takes_the_least_mean_cost() -> None:
     assert len(tried) == 2 * 38
 
 
-def test_search_passes_over_a_schedule_that_loses_a_state() -> None:
+def test_search_skips_a_schedule_that_is_infeasible_for_a_state() -> None:
     def cost_of(design: Design, state: Array) -> float | None:
         eager = design.schedule.delays[4] == 4
         if eager and state[0] == 35.0:
@@ -139,7 +139,7 @@ def test_search_needs_states_and_a_cost() -> None:
         make_design(spec("paper", rule="search", search_states=STATES))
 
 
-def test_search_with_nothing_left_says_why() -> None:
+def test_search_without_a_candidate_gives_the_reason() -> None:
     with pytest.raises(DesignError, match=r"schedule\.rule: none of 38 nested schedules .* 0 fail .* 38 leave one of"):
         make_design(spec("paper", rule="search", search_states=STATES), lambda *_: None)
     with pytest.raises(DesignError, match=r"38 fail Assumption 4, 0 leave .*Assumption 4\.4 fails"):
@@ -148,7 +148,7 @@ def test_search_with_nothing_left_says_why() -> None:
 
 
 def test_search_over_too_many_schedules_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(design_module, "MOST_CANDIDATES", 37)
+    monkeypatch.setattr(design_module, "MAX_CANDIDATES", 37)
     with pytest.raises(DesignError, match=r"schedule\.rule: `search` has more than 37 nested schedules"):
         make_design(spec("paper", rule="search", search_states=STATES), lambda *_: 1.0)
 
@@ -173,7 +173,7 @@ def test_search_over_too_many_schedules_is_refused(monkeypatch: pytest.MonkeyPat
         ("paper", {"delays": 3}, "schedule.delays", r"d_11 = 3 is below 4"),
     ],
 )
-def test_a_design_that_cannot_be_is_refused(name: str, changes: dict[str, Any], key: str, message: str) -> None:
+def test_an_impossible_design_is_refused(name: str, changes: dict[str, Any], key: str, message: str) -> None:
     with pytest.raises(DesignError, match=message) as caught:
         make_design(spec(name, **changes))
     assert caught.value.key == key
@@ -188,7 +188,7 @@ def test_record_is_json_without_infinity(name: str) -> None:
     assert record["design_id"] == design.design_id
     assert record["tau"] == design.terminal.tau
     assert record["delays"] == list(design.schedule.delays)
-    for key, wanted in (
+    for key, expected in (
         ("alpha", design.schedule.alpha),
         ("gamma_x", design.schedule.gamma_x),
         ("gamma_u", design.schedule.gamma_u),
@@ -197,7 +197,7 @@ def test_record_is_json_without_infinity(name: str) -> None:
         ("c_x", design.state_set.c),
         ("sigma_x", design.terminal.sigma_x),
     ):
-        assert np.array_equal(np.array(record[key]), wanted)
+        assert np.array_equal(np.array(record[key]), expected)
     assert [row["item"] for row in record["assumptions"]] == ["4.1", "4.2", "4.3", "4.4", "4.5"]
     assert set(record["assumptions"][0]) == {"item", "ok", "value", "limit", "text"}
     assert record["spectral_radius"] == design.terminal.spectral_radius

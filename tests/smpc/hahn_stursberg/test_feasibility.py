@@ -1,4 +1,4 @@
-"""Which schedules can meet the terminal condition, and what a state costs."""
+"""Margin of the terminal condition by schedule, and the optimal cost of a state."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def test_margin_is_reached_and_no_gain_goes_beyond_it() -> None:
     # Whatever the solver left: exactly orthogonal to every gain, and of norm 1, so that the bound is one by itself.
     exact = z.value.ravel() - matrix @ np.linalg.lstsq(matrix, z.value.ravel(), rcond=None)[0]
     exact /= np.linalg.norm(exact.reshape(bound.rows, bound.columns), "nuc")
-    most = 1.0 - float(exact @ bound.y.offset) ** 2
-    assert margin <= most + 1e-8
-    assert margin == pytest.approx(most, abs=1e-6)
+    maximum = 1.0 - float(exact @ bound.y.offset) ** 2
+    assert margin <= maximum + 1e-8
+    assert margin == pytest.approx(maximum, abs=1e-6)
 
 
 def test_longer_delays_leave_less_margin() -> None:
@@ -93,7 +93,7 @@ def test_terminal_condition_with_a_singular_transition_is_reduced_again() -> Non
     assert exact.cost == pytest.approx(relaxed[1], rel=1e-6)
 
 
-def test_optimal_cost_is_the_papers_and_none_where_constraints_give_way() -> None:
+def test_optimal_cost_is_the_papers_and_none_where_constraints_are_relaxed() -> None:
     design = paper()
     assert optimal_cost(design, START) == pytest.approx(PAPER_COST, abs=0.01)
     for outside in ([80.0, 60.0, 0.0, 0.0], [48.0, 7.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 0.0]):
@@ -101,11 +101,11 @@ def test_optimal_cost_is_the_papers_and_none_where_constraints_give_way() -> Non
     assert optimal_cost(paper(delays=6), ORIGIN) is None
 
 
-def test_the_margin_of_a_design_is_found_once_for_all_its_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Design] = []
+def test_the_margin_of_a_design_is_computed_once_for_all_its_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    designs: list[Design] = []
 
     def counted(design: Design) -> float:
-        asked.append(design)
+        designs.append(design)
         return check_schedule(design)
 
     monkeypatch.setattr(feasibility, "check_schedule", counted)
@@ -114,18 +114,18 @@ def test_the_margin_of_a_design_is_found_once_for_all_its_states(monkeypatch: py
         assert optimal_cost(good, share * START) is not None
     for share in (1.0, 0.5):
         assert optimal_cost(slow, share * START) is None
-    assert asked == [good, slow]
+    assert designs == [good, slow]
 
 
 def test_search_takes_the_cheapest_of_its_candidates() -> None:
     spec = replace(paper_spec(), horizon=9, rule="search", search_states=np.array([[5.0, -1.0, -3.0, 1.0]]))
-    seen: list[float | None] = []
+    costs: list[float | None] = []
 
     def cost_of(design: object, x: object) -> float | None:
-        seen.append(optimal_cost(design, x))  # type: ignore[arg-type]  # make_design's own arguments
-        return seen[-1]
+        costs.append(optimal_cost(design, x))  # type: ignore[arg-type]  # make_design's own arguments
+        return costs[-1]
 
     chosen = make_design(spec, cost_of)
-    known = [cost for cost in seen if cost is not None]
-    assert len(seen) > 1
+    known = [cost for cost in costs if cost is not None]
+    assert len(costs) > 1
     assert optimal_cost(chosen, spec.search_states[0]) == min(known)

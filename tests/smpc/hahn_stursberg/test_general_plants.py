@@ -1,4 +1,4 @@
-"""Plants of every shape: the exact program against the problem written down again, and what redundancy comes to."""
+"""Plants of many shapes: the exact program against the problem written again, and redundancy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL
 from uavctl.smpc.hahn_stursberg.design import make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, PartSolver
-from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of, whole
+from uavctl.smpc.hahn_stursberg.horizon import decompose, make_horizon, make_whole_component
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import find_equilibria
@@ -39,8 +39,8 @@ def test_cost_is_that_of_the_problem_written_down_again_and_every_row_is_kept(na
     made = case(name)
     assert abs(made.answer.gap) < 1e-7
     assert made.answer.cost == pytest.approx(reduced_cost(made.design, made.x), rel=1e-6)
-    least = margins(made.design, made.solver, made.x)
-    assert {row: margin for row, margin in least.items() if margin < -1e-6} == {}
+    minimum = margins(made.design, made.solver, made.x)
+    assert {row: margin for row, margin in minimum.items() if margin < -1e-6} == {}
 
 
 @pytest.mark.slow
@@ -70,7 +70,7 @@ def test_the_printed_form_of_an_axis_that_nothing_disturbs() -> None:
 
 
 @pytest.mark.slow
-def test_shapes_cover_what_they_are_to_cover() -> None:
+def test_shapes_cover_all_kinds() -> None:
     plants = {shape.name: case(shape.name).design for shape in SHAPES if shape.horizon <= 20}
     assert any(design.plant.n_w > design.plant.n_x for design in plants.values())
     assert any(design.plant.n_w < design.plant.n_u for design in plants.values())
@@ -85,9 +85,9 @@ def test_shapes_cover_what_they_are_to_cover() -> None:
 # --- redundancy -------------------------------------------------------------------------------------------------------
 
 
-def test_what_the_state_does_not_show_is_not_fed_back() -> None:
+def test_disturbances_without_effect_on_the_state_are_not_fed_back() -> None:
     made = case("repeated disturbance 0")
-    horizon = horizon_of(made.design, whole(made.design))
+    horizon = make_horizon(made.design, make_whole_component(made.design))
     # w_1 and 2 w_2 push alike and w_3 not at all: one number is known of the three.
     assert horizon.feedback.shape == (1, 3)
     assert horizon.feedback[0] / horizon.feedback[0, 0] == pytest.approx([1.0, 2.0, 0.0], abs=1e-9)
@@ -100,7 +100,7 @@ def test_what_the_state_does_not_show_is_not_fed_back() -> None:
     assert answer.cost == pytest.approx(made.answer.cost, rel=1e-8)
 
 
-def test_several_inputs_that_push_alike_share_the_work_by_their_cost() -> None:
+def test_parallel_inputs_share_the_effort_by_their_cost() -> None:
     made = case("redundant inputs 1")
     plant = made.design.plant
     calm = make_design(replace(made.spec, plant=replace(plant, w=0.0 * plant.w)))
@@ -115,9 +115,9 @@ def test_inputs_at_rest_cost_the_least_of_those_that_hold_the_place() -> None:
     # A spring to the origin; u_1 + 2 u_2 = 1 holds p = 1. Lagrange: u_i = g_i / q_i · 1 / Σ g² / q.
     a = np.array([[1.0, 0.5], [-0.3, 0.6]])
     b = np.array([[0.0, 0.0], [0.3, 0.6]])
-    found = find_equilibria(a, b, np.eye(2), np.diag([1.0, 2.0]), np.array([0]))
-    assert found.x_eq == pytest.approx(np.array([[1.0], [0.0]]), abs=1e-12)
-    assert found.u_eq[:, 0] == pytest.approx(np.array([1.0, 1.0]) / 3.0)
+    result = find_equilibria(a, b, np.eye(2), np.diag([1.0, 2.0]), np.array([0]))
+    assert result.x_eq == pytest.approx(np.array([[1.0], [0.0]]), abs=1e-12)
+    assert result.u_eq[:, 0] == pytest.approx(np.array([1.0, 1.0]) / 3.0)
     # An input that costs nothing beside the other does it all.
     free = find_equilibria(a, b, np.eye(2), np.diag([1.0, 0.0]), np.array([0]))
     assert free.u_eq[:, 0] == pytest.approx([0.0, 0.5])
@@ -128,10 +128,10 @@ def test_a_chain_rests_where_its_spring_does_and_goes_to_the_nearest_such_place(
     (part,) = decompose(made.design)
     assert part.x_eq[:, 0] == pytest.approx([1.0, 0.0, 1.0, 0.0], abs=1e-9)
     solver = ConicSolver(made.design)
-    apart = np.array([0.2, 0.0, -0.1, 0.0])
+    difference = np.array([0.2, 0.0, -0.1, 0.0])
     weight = np.diagonal(made.design.q_x)[[0, 2]]
-    between = weight @ apart[[0, 2]] / weight.sum()
-    answer = solver.solve(0, np.zeros(4), apart)
+    between = weight @ difference[[0, 2]] / weight.sum()
+    answer = solver.solve(0, np.zeros(4), difference)
     assert answer.status is SolveStatus.OPTIMAL
     assert answer.reference == pytest.approx(between * np.array([1.0, 0.0, 1.0, 0.0]), abs=1e-6)
 
@@ -173,11 +173,11 @@ def test_acceleration_of_inputs_that_are_not_one_an_axis() -> None:
 
 def test_a_plant_of_six_axes_in_three_names() -> None:
     """Axes without a name rest at the origin of theirs."""
-    one = paper_plant()
+    item = paper_plant()
     plant = Plant(
-        a=kron(np.eye(2), one.a),
-        b=kron(np.eye(2), one.b),
-        e=kron(np.eye(2), one.e),
+        a=kron(np.eye(2), item.a),
+        b=kron(np.eye(2), item.b),
+        e=kron(np.eye(2), item.e),
         w=0.6 * np.eye(4),
         dt_s=1.0,
         axes=("north", "east"),

@@ -11,11 +11,11 @@ from optimisation_cases import TAU_3, coupled, paper, paper_plant, room
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, terminal_bound, whole
+from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, make_whole_component, terminal_bound
 from uavctl.smpc.sets import Polytope
 
 
-def horizon_of(design: Design, component: Component) -> Horizon:
+def make_horizon(design: Design, component: Component) -> Horizon:
     return Horizon(component, design.horizon, design.terminal.tau, design.schedule)
 
 
@@ -47,7 +47,7 @@ def psd_root(matrix: Array) -> Array:
 
 CASES = {
     "paper": (paper, decompose),
-    "joint": (paper, lambda design: (whole(design),)),
+    "joint": (paper, lambda design: (make_whole_component(design),)),
     "coupled": (coupled, decompose),
     "room": (room, decompose),
     "room, tau = 3": (lambda: room(**TAU_3), decompose),
@@ -58,13 +58,13 @@ CASES = {
 def case(request: pytest.FixtureRequest) -> tuple[Design, Horizon]:
     make, split = CASES[request.param]
     design = make()
-    return design, horizon_of(design, split(design)[0])
+    return design, make_horizon(design, split(design)[0])
 
 
 def test_the_paper_has_28_gains_and_8_free_inputs_an_axis() -> None:
     design = paper()
     for component in decompose(design):
-        horizon = horizon_of(design, component)
+        horizon = make_horizon(design, component)
         assert (horizon.n_theta, horizon.gamma.shape[2]) == (28, 8)
         assert all(r <= t - 5 for t, r, _, _ in horizon.gains)
 
@@ -82,10 +82,10 @@ def test_prediction_is_what_the_recursion_gives(case: tuple[Design, Horizon]) ->
     states, inputs = simulate(horizon, x, v, gains_of(horizon, theta), noise_w)
     for t in range(horizon.steps + 1):
         mean = horizon.phi[t] @ x + horizon.gamma[t] @ free.ravel() + horizon.gamma_eq[t] @ y
-        noise = horizon.state_noise(t, np.eye(n_x)).at(theta).reshape(n_x, -1) @ omega.ravel()
+        noise = horizon.state_noise(t, np.eye(n_x)).evaluate(theta).reshape(n_x, -1) @ omega.ravel()
         assert mean + noise == pytest.approx(states[t], abs=1e-9)
     for t in range(horizon.steps):
-        noise = horizon.input_noise(t, np.eye(n_u)).at(theta).reshape(n_u, -1) @ omega.ravel()
+        noise = horizon.input_noise(t, np.eye(n_u)).evaluate(theta).reshape(n_u, -1) @ omega.ravel()
         assert v[t] + noise == pytest.approx(inputs[t], abs=1e-9)
 
 
@@ -117,18 +117,18 @@ def test_reduced_terminal_condition_has_the_sign_of_the_full_one(case: tuple[Des
         theta = scale * rng.normal(size=horizon.n_theta)
         effect = np.vstack(
             [
-                horizon.state_noise(t, np.eye(part.a.shape[0])).at(theta).reshape(part.a.shape[0], -1)
+                horizon.state_noise(t, np.eye(part.a.shape[0])).evaluate(theta).reshape(part.a.shape[0], -1)
                 for t in range(horizon.free, horizon.steps + 1)
             ]
         )
         full = np.linalg.eigvalsh(part.sigma_xi - effect @ effect.T)[0]
-        size = np.linalg.norm(reduced.y.at(theta).reshape(reduced.rows, reduced.columns), 2)
+        size = np.linalg.norm(reduced.y.evaluate(theta).reshape(reduced.rows, reduced.columns), 2)
         assert (full >= -1e-9) == (size <= 1.0 + 1e-9)
         sizes.append(size)
     assert max(sizes) > 1.0
 
 
-def test_feedback_of_what_the_terminal_law_does_not_know_is_refused() -> None:
+def test_feedback_of_disturbances_unknown_to_the_terminal_law_is_refused() -> None:
     design = paper()
     short = replace(design.schedule, delays=(5,) * 11 + (3,))
     with pytest.raises(DesignError, match=r"schedule\.delays: delay 3 in stage 11"):
@@ -146,7 +146,7 @@ def test_independent_axes_are_components_with_their_own_rows() -> None:
     assert north.u_eq == pytest.approx(np.zeros((1, 1)), abs=1e-12)
 
 
-def test_anything_that_couples_axes_joins_them() -> None:
+def test_any_coupling_joins_axes() -> None:
     correlated = paper(plant=paper_plant(w=np.array([[0.6, 0.1], [0.1, 0.6]])))
     weights = np.diag([10.0, 0.1, 10.0, 0.1])
     weights[0, 2] = weights[2, 0] = 1.0

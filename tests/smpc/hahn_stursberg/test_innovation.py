@@ -1,4 +1,4 @@
-"""Innovations form: the same open-loop statistics as plant and filter, and honest back-offs."""
+"""Innovations form: the open-loop statistics of plant and filter, and back-offs that keep their risk."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def one_axis(wind_std_mps2: float) -> Plant:
 
 
 def coupled() -> Plant:
-    """Two axes that drag at one another, with correlated gusts."""
+    """Two coupled axes, with correlated gusts."""
     plant = drag_lag([0.3, 0.4], [0.25, 0.2], [1.0, 1.0], [0.15, 0.1], 0.2, ("north", "east"))
     a = plant.a.copy()
     a[1, 4] = a[4, 1] = 0.02
@@ -95,15 +95,15 @@ def test_open_loop_covariance_is_that_of_the_state(plant: Plant, age_s: float) -
     assert form.plant.n_w == n_y
     np.testing.assert_array_equal(form.plant.w, np.eye(n_y))
     truth = form.estimate_cov
-    seen = np.zeros_like(truth)
+    propagated = np.zeros_like(truth)
     for _ in range(12):
         truth = plant.a @ truth @ plant.a.T + plant.e @ plant.w @ plant.e.T
-        seen = plant.a @ seen @ plant.a.T + form.plant.e @ form.plant.e.T
-        np.testing.assert_allclose(seen + form.estimate_cov, truth, rtol=0, atol=1e-10 * np.abs(truth).max())
+        propagated = plant.a @ propagated @ plant.a.T + form.plant.e @ form.plant.e.T
+        np.testing.assert_allclose(propagated + form.estimate_cov, truth, rtol=0, atol=1e-10 * np.abs(truth).max())
 
 
 def arrivals(loss: float, steps: int, phase_ns: int, seed: int) -> tuple[list[Belief], list[int], Array]:
-    """The real filter on the room's plant with lost positions: beliefs at boundaries with news, and the true states."""
+    """Run the flight's filter on the room's plant with lost positions: beliefs after positions, and true states."""
     rng = np.random.default_rng(seed)
     real = kalman(ROOM)
     first, second = ROOM.transition((STEP_NS - phase_ns) / 1e9), ROOM.transition(phase_ns / 1e9)
@@ -137,16 +137,16 @@ def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
 @pytest.mark.slow
 def test_the_bound_holds_at_nearly_every_arrival() -> None:
     """Loss 0.3: every deviation in at least 99 % of arrivals, whatever the phase of the positions."""
-    moved = [0, 1, 3, 4, 6, 7]  # nothing disturbs the accelerations
-    bound = np.diagonal(innovation_form(ROOM, STD_M, 0.2, losses=5).estimate_cov)[moved]
+    disturbed = [0, 1, 3, 4, 6, 7]  # nothing disturbs the accelerations
+    bound = np.diagonal(innovation_form(ROOM, STD_M, 0.2, losses=5).estimate_cov)[disturbed]
     for phase_ns in (20_000_000, 100_000_000, 199_000_000):
         beliefs, _, _ = arrivals(0.3, 2000, phase_ns, seed=2)
-        variances = np.array([np.diagonal(belief.cov)[moved] for belief in beliefs[50:]])
+        variances = np.array([np.diagonal(belief.cov)[disturbed] for belief in beliefs[50:]])
         assert np.all(variances <= bound, axis=1).mean() >= 0.99
 
 
 @pytest.mark.slow
-def test_back_offs_of_the_first_stages_are_honest() -> None:
+def test_back_offs_of_the_first_stages_keep_their_risk() -> None:
     """Monte Carlo: real filter, positions lost, and the error of its prediction as the plan has it."""
     design = room()
     beliefs, places, states = arrivals(0.3, 6000, 100_000_000, seed=3)
@@ -178,7 +178,7 @@ def test_a_room_keeps_its_three_components_and_its_terminal_margin() -> None:
     assert check_schedule(make_design(spec("room-hahn-stursberg"))) == pytest.approx(0.05241, abs=1e-4)
 
 
-def test_the_terminal_set_has_the_estimate_s_error_in_it() -> None:
+def test_the_terminal_set_includes_the_estimate_error() -> None:
     design = room()
     check = next(check for check in design.assumptions if check.item == "4.3")
     covariance = design.terminal.sigma_x + design.estimate_cov
@@ -197,17 +197,17 @@ def test_the_terminal_set_has_the_estimate_s_error_in_it() -> None:
 def test_older_positions_longer_gaps_and_more_noise_never_help(
     age_s: float, more_s: float, gap: int, std_m: float
 ) -> None:
-    one = innovation_form(ROOM, std_m, age_s, gap).estimate_cov
+    entry = innovation_form(ROOM, std_m, age_s, gap).estimate_cov
     older = innovation_form(ROOM, std_m, age_s + more_s, gap).estimate_cov
-    assert np.all(np.diagonal(older) >= np.diagonal(one))
+    assert np.all(np.diagonal(older) >= np.diagonal(entry))
     for other in (innovation_form(ROOM, std_m, age_s, gap + 1), innovation_form(ROOM, 1.5 * std_m, age_s, gap)):
-        assert np.linalg.eigvalsh(other.estimate_cov - one)[0] >= -1e-9 * np.abs(one).max()
+        assert np.linalg.eigvalsh(other.estimate_cov - entry)[0] >= -1e-9 * np.abs(entry).max()
 
 
 def test_an_axis_that_nothing_disturbs_is_known() -> None:
     plant = drag_lag([0.3, 0.3], [0.25, 0.25], [1.0, 1.0], [0.15, 0.0], 0.2, ("north", "east"))
-    form, alone = innovation_form(plant, STD_M, 0.1, 4), innovation_form(one_axis(0.15), STD_M, 0.1, 4)
-    np.testing.assert_allclose(form.estimate_cov[:3, :3], alone.estimate_cov, rtol=1e-9, atol=0)
+    form, single = innovation_form(plant, STD_M, 0.1, 4), innovation_form(one_axis(0.15), STD_M, 0.1, 4)
+    np.testing.assert_allclose(form.estimate_cov[:3, :3], single.estimate_cov, rtol=1e-9, atol=0)
     assert not form.estimate_cov[3:].any()
     assert not form.plant.e[3:].any()
 

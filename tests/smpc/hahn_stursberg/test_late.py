@@ -24,7 +24,7 @@ from uavctl.errors import DesignError
 from uavctl.records import Decision, Plan, SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver, make_late, with_late
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, add_late_designs, make_late_design
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
@@ -110,9 +110,9 @@ def from_capture(design: Design, late: int, x: Array, flown: Array) -> tuple[flo
 @pytest.mark.parametrize("late", [1, 2, 5])
 @pytest.mark.parametrize(("x", "flown"), [((35.0, -2.0), -3.0), ((-20.0, 3.0), 2.0), ((2.0, 0.0), 0.5)])
 def test_a_late_plan_is_the_plan_from_the_capture(late: int, x: tuple[float, float], flown: float) -> None:
-    asked = axis_spec()
-    design = make_design(asked)
-    made = make_late(design, asked, late)
+    design_spec = axis_spec()
+    design = make_design(design_spec)
+    made = make_late_design(design, design_spec, late)
     inputs = flown * np.linspace(1.0, 0.4, late)
     now = np.array(x)
     for u in inputs:
@@ -124,27 +124,27 @@ def test_a_late_plan_is_the_plan_from_the_capture(late: int, x: tuple[float, flo
     assert answer.cost == pytest.approx(total - sunk, rel=1e-6)
 
 
-def test_nothing_late_is_the_design_itself() -> None:
-    asked = paper_spec()
-    design = make_design(asked)
-    assert make_late(design, asked, 0) is design
-    assert with_late(design, asked, 0) is design
+def test_a_delay_of_zero_is_the_design_itself() -> None:
+    design_spec = paper_spec()
+    design = make_design(design_spec)
+    assert make_late_design(design, design_spec, 0) is design
+    assert add_late_designs(design, design_spec, 0) is design
     assert build_design(load_config("paper")).late == ()
 
 
-def test_plans_on_time_have_the_same_bits_beside_late_ones() -> None:
-    asked = paper_spec()
-    design = make_design(asked)
-    both = with_late(design, asked, 2)
+def test_plans_on_time_have_the_same_bits_with_late_designs() -> None:
+    design_spec = paper_spec()
+    design = make_design(design_spec)
+    both = add_late_designs(design, design_spec, 2)
     assert both.design_id != design.design_id
     assert [late.past for late in both.late] == [1, 2]
     x, target = np.array([35.0, -2.0, -20.0, -4.0]), np.zeros(4)
     solver = ConicSolver(both)
     solver.solve(0, x, target, Preview(age=2))
-    one, other = solver.solve(0, x, target), ConicSolver(design).solve(0, x, target)
-    assert one.cost == other.cost
-    np.testing.assert_array_equal(one.inputs, other.inputs)
-    np.testing.assert_array_equal(one.backoff_x, other.backoff_x)
+    item, other = solver.solve(0, x, target), ConicSolver(design).solve(0, x, target)
+    assert item.cost == other.cost
+    np.testing.assert_array_equal(item.inputs, other.inputs)
+    np.testing.assert_array_equal(item.backoff_x, other.backoff_x)
     assert solver.solve(0, x, target, Preview(age=3)).status is SolveStatus.FAILED
 
 
@@ -152,9 +152,9 @@ def test_plans_on_time_have_the_same_bits_beside_late_ones() -> None:
 @pytest.mark.parametrize("preset", ["paper", "room-hahn-stursberg"])
 def test_back_offs_grow_with_the_age(preset: str) -> None:
     """Of every state row, in every stage before the feedback sets in."""
-    asked = spec(preset)
-    solver = ConicSolver(with_late(make_design(asked), asked, 3))
-    target = asked.plant.equilibrium(asked.target_m)
+    design_spec = spec(preset)
+    solver = ConicSolver(add_late_designs(make_design(design_spec), design_spec, 3))
+    target = design_spec.plant.equilibrium(design_spec.target_m)
     answers = [solver.solve(0, target, target, Preview(age=j)) for j in range(4)]
     for younger, older in pairwise(answers):
         assert older.status is SolveStatus.OPTIMAL
@@ -164,30 +164,30 @@ def test_back_offs_grow_with_the_age(preset: str) -> None:
 
 def test_the_delays_are_kept_and_the_likelihoods_conditional() -> None:
     """Independent losses: α = 1 - q^min(d, t) counted from now; bursts: a loss now makes the next more likely."""
-    asked = paper_spec()
-    late = make_late(make_design(asked), asked, 3)
+    design_spec = paper_spec()
+    late = make_late_design(make_design(design_spec), design_spec, 3)
     assert late.schedule.delays == (4, 5, 6, 7, 8, 5, 5, 5, 5, 5, 5, 5)  # the first five feed nothing back
     np.testing.assert_allclose(late.schedule.alpha, [1.0] * 5 + [1.0 - 0.3**5] * 7, rtol=1e-12)
     bursts = paper_spec(link=gilbert_elliott(enter=0.05, leave=0.6, good_loss=0.1, bad_loss=0.9))
     design = make_design(bursts)
-    ages = [make_late(design, bursts, j).schedule.alpha[5] for j in (0, 1, 2)]
+    ages = [make_late_design(design, bursts, j).schedule.alpha[5] for j in (0, 1, 2)]
     assert ages[0] > ages[1] > ages[2]
 
 
-def test_joint_likelihoods_are_no_more_cautious_than_the_product() -> None:
+def test_joint_likelihoods_are_at_most_those_of_the_product() -> None:
     plain, joint = paper_spec(), paper_spec(joint=True)
-    product = make_late(make_design(plain), plain, 2).schedule
-    exact = make_late(make_design(joint), joint, 2).schedule
+    product = make_late_design(make_design(plain), plain, 2).schedule
+    exact = make_late_design(make_design(joint), joint, 2).schedule
     assert np.all(exact.gamma_x[1:] <= product.gamma_x[1:] + 1e-12)
     assert exact.gamma_x[-1] < product.gamma_x[-1]
 
 
 def test_an_age_without_a_design_is_named() -> None:
     # After losses in a row the channel is likely bad, and stays so for long.
-    asked = paper_spec(link=gilbert_elliott(enter=0.01, leave=0.4, good_loss=0.05, bad_loss=0.95))
-    design = make_design(asked)
+    design_spec = paper_spec(link=gilbert_elliott(enter=0.01, leave=0.4, good_loss=0.05, bad_loss=0.95))
+    design = make_design(design_spec)
     with pytest.raises(DesignError, match=r"positions of age [123]: .* probability 0\.\d+") as caught:
-        with_late(design, asked, 3)
+        add_late_designs(design, design_spec, 3)
     assert caught.value.key in ("smpc.delta_x", "smpc.delta_u")
 
 
@@ -242,7 +242,7 @@ CAMERAS = [
 
 @pytest.mark.parametrize("overrides", CAMERAS)
 def test_the_age_counts_all_positions_of_a_step_that_a_delay_lets_through(overrides: list[str]) -> None:
-    """With one captured at each boundary, the longest way, it is the age that comes about."""
+    """With one position at each boundary and the longest delay, the model is the age in flight."""
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", *overrides])
     link, measured = build_delayed_link(config), silent(config, 0.0, 6)
     promised = np.array([link.outage(step) for step in range(7)])
@@ -261,7 +261,7 @@ def test_the_age_counts_all_positions_of_a_step_that_a_delay_lets_through(overri
         ["plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "link.delay_s=0.04", "link.jitter_s=0"],
     ],
 )
-def test_no_age_is_more_frequent_than_promised(overrides: list[str], phase: float) -> None:
+def test_no_age_is_more_frequent_than_by_design(overrides: list[str], phase: float) -> None:
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", *overrides])
     one_a_step = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", *overrides, "source.rate_hz=0"])
     link, measured = build_delayed_link(config), silent(config, phase, 6)
@@ -273,8 +273,8 @@ def test_no_age_is_more_frequent_than_promised(overrides: list[str], phase: floa
 @pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.8])
 @pytest.mark.parametrize("overrides", CAMERAS)
-def test_positions_that_are_younger_than_promised_use_up_no_more_risk(overrides: list[str], phase: float) -> None:
-    """A link's model is of the longest ways: the budget of an age that it has not must not be a licence."""
+def test_younger_positions_than_by_design_use_no_more_risk(overrides: list[str], phase: float) -> None:
+    """The model has the longest delays: an age that it excludes must not get a larger budget."""
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", "smpc.horizon=48", *overrides])
     risk = build_conditioned(config).solver.risk
     measured = silent(config, phase, 12)
@@ -292,13 +292,13 @@ def test_positions_that_are_younger_than_promised_use_up_no_more_risk(overrides:
         (["link.delay_s=0.25", "link.loss=0.3"], "smpc.delta_x", r"out of reach"),
     ],
 )
-def test_delays_that_no_design_stands_are_refused(overrides: list[str], key: str, figures: str) -> None:
+def test_delays_without_a_design_are_refused(overrides: list[str], key: str, figures: str) -> None:
     with pytest.raises(DesignError, match=figures) as caught:
         build_design(load_config("room-hahn-stursberg", overrides))
     assert caught.value.key == key
 
 
-def test_the_printed_solver_is_for_what_it_knows() -> None:
+def test_the_printed_solver_refuses_late_positions() -> None:
     for overrides in (["schedule.late=1", "risk.estimate=exact"], ["risk.estimate=innovations"]):
         config = load_config("room-hahn-stursberg", ["solver.method=printed", *overrides])
         with pytest.raises(DesignError) as caught:

@@ -1,4 +1,4 @@
-"""The mean half of the decision problem against a simulation of means, and against the exact program."""
+"""The mean part of the decision problem against a simulation of means, and against the exact program."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from scipy.linalg import null_space
 from uavctl.arrays import Array
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row, RowKind
-from uavctl.smpc.hahn_stursberg.policy import Covariance
+from uavctl.smpc.hahn_stursberg.policy import CovarianceProblem
 
 
 def problem_of(design: Design, i: int) -> MeanProblem:
-    return MeanProblem(design, horizon_of(design, decompose(design)[i]))
+    return MeanProblem(design, make_horizon(design, decompose(design)[i]))
 
 
 def simulated(design: Design, part: Component, x: Array, v: Array, y: Array) -> tuple[Array, Array]:
@@ -30,7 +30,7 @@ def simulated(design: Design, part: Component, x: Array, v: Array, y: Array) -> 
 
 
 def placed(row: Row, part: Component, states: Array, inputs: Array, y: Array, there: Array) -> float:
-    """What a row limits, in the simulated mean."""
+    """Return the limited value of a row in the simulated mean."""
     what = {
         RowKind.INPUT: inputs[min(row.t, len(inputs) - 1)],
         RowKind.STATE: states[row.t],
@@ -70,16 +70,16 @@ def test_cost_rows_and_inputs_are_those_of_a_simulation(design: Design, i: int, 
         if ask.preview.path is not None:
             path_x = ask.preview.path.states[:free, part.states]
             path_u = ask.preview.path.inputs[:free, part.inputs]
-        wanted = sum(
+        expected = sum(
             (a := states[t] - part.x_eq @ y - path_x[t]) @ part.q_x @ a
             + (b := inputs[t] - part.u_eq @ y - path_u[t]) @ part.q_u @ b
             for t in range(free)
         )
-        assert question.constant + q @ (0.5 * problem.h @ q + question.f) == pytest.approx(wanted, rel=1e-9)
+        assert question.constant + q @ (0.5 * problem.h @ q + question.f) == pytest.approx(expected, rel=1e-9)
         values = problem.a @ q + question.offset
         for row, value in zip(problem.rows, values, strict=True):
-            wanted = placed(row, part, states, inputs, y, there)
-            assert value == pytest.approx(wanted, abs=1e-10 * size)
+            expected = placed(row, part, states, inputs, y, there)
+            assert value == pytest.approx(expected, abs=1e-10 * size)
 
 
 @pytest.mark.parametrize(("design", "i"), CASES)
@@ -104,7 +104,7 @@ def test_every_limit_has_its_row_and_side(design: Design, i: int) -> None:
     """Counted and placed from the sets: stages 0 … N-1 of the inputs, 1 … N-1 of the states, the terminal rows."""
     problem, part = problem_of(design, i), decompose(design)[i]
     free = design.horizon - design.terminal.tau
-    told = set()
+    reported = set()
     for row, upper, lower in zip(problem.rows, problem.upper, problem.lower, strict=True):
         if row.kind is RowKind.OFFSET:
             assert (upper, lower) == (0.0, 0.0)
@@ -116,12 +116,14 @@ def test_every_limit_has_its_row_and_side(design: Design, i: int) -> None:
             else:
                 assert c[side] == pytest.approx(sign * row.c)
                 assert value == b[side]
-                told.add((row.kind, row.t, side))
-    wanted = {(RowKind.INPUT, t, k) for t in range(free) for k in range(len(part.b_u))}
-    wanted |= {(RowKind.STATE, t, k) for t in range(1, free) for k in range(len(part.b_x))}
-    wanted |= {(RowKind.REFERENCE, free, k) for k in np.flatnonzero(np.any(part.c_x @ part.x_eq != 0, axis=1)).tolist()}
-    wanted |= {(RowKind.REST, free, k) for k in np.flatnonzero(np.any(part.c_u @ part.u_eq != 0, axis=1)).tolist()}
-    assert told == wanted
+                reported.add((row.kind, row.t, side))
+    expected = {(RowKind.INPUT, t, k) for t in range(free) for k in range(len(part.b_u))}
+    expected |= {(RowKind.STATE, t, k) for t in range(1, free) for k in range(len(part.b_x))}
+    expected |= {
+        (RowKind.REFERENCE, free, k) for k in np.flatnonzero(np.any(part.c_x @ part.x_eq != 0, axis=1)).tolist()
+    }
+    expected |= {(RowKind.REST, free, k) for k in np.flatnonzero(np.any(part.c_u @ part.u_eq != 0, axis=1)).tolist()}
+    assert reported == expected
     assert sum(row.kind is RowKind.OFFSET for row in problem.rows) == part.x_eq.shape[1]
 
 
@@ -135,19 +137,19 @@ def test_backoffs_that_no_gain_moves_are_those_of_the_open_loop(design: Design, 
     first = {t for t, *_ in problem.horizon.gains}
     checked = 0
     for k, row in enumerate(problem.rows):
-        linked = k in problem.links
+        linked = k in problem.gain_rows
         if row.kind is RowKind.INPUT:
             assert linked == (row.t in first)
             assert linked or problem.backoff[k] == 0.0
         elif row.kind is RowKind.STATE and row.t <= min(first):
-            wanted = design.kappa_x[row.t] * np.sqrt(row.c @ (covariances[row.t] + part.estimate_cov) @ row.c)
+            expected = design.kappa_x[row.t] * np.sqrt(row.c @ (covariances[row.t] + part.estimate_cov) @ row.c)
             assert not linked
-            assert problem.backoff[k] == pytest.approx(wanted, rel=1e-12)
+            assert problem.backoff[k] == pytest.approx(expected, rel=1e-12)
             checked += 1
         elif row.kind is RowKind.REFERENCE:
             sigma_x = part.sigma_x + part.estimate_cov
-            wanted = design.kappa_x_terminal * np.sqrt(row.c @ sigma_x @ row.c)
-            assert problem.backoff[k] == pytest.approx(wanted, rel=1e-12)
+            expected = design.kappa_x_terminal * np.sqrt(row.c @ sigma_x @ row.c)
+            assert problem.backoff[k] == pytest.approx(expected, rel=1e-12)
     assert checked > 0
 
 
@@ -172,20 +174,20 @@ def test_limits_that_move_are_those_of_each_stage_and_the_least_of_the_last_ones
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_exact_program_s_answer_costs_the_same_here_and_is_the_best_under_its_policy(name: str) -> None:
-    """Back-offs of the exact gains, the mean solved by another solver: the exact optimum, whatever is known ahead."""
+    """With back-offs of the exact gains, another solver of the mean finds the exact optimum, for every preview."""
     design = design_of(name)
-    one = Case(design)
+    case = Case(design)
     checked = 0
     for ask in all_kinds(design, 5, 3):
-        for i in range(len(one.components)):
-            answer = one.exact[i].solve(ask.x, ask.target, ask.preview)
+        for i in range(len(case.components)):
+            answer = case.exact[i].solve(ask.x, ask.target, ask.preview)
             if answer.terminal_miss > 1e-6:
                 continue  # from there no equilibrium is in reach
-            problem, theta = one.problems[i], exact_gains(one, i, ask)
-            covariance = Covariance(problem.horizon, [problem.rows[k] for k in problem.links])
+            problem, theta = case.problems[i], exact_gains(case, i, ask)
+            covariance = CovarianceProblem(problem.horizon, [problem.rows[k] for k in problem.gain_rows])
             backoff = problem.backoff.copy()
-            backoff[problem.links] = covariance.backoffs(theta)
-            question = one.question(i, ask.x, ask.target, ask.preview)
+            backoff[problem.gain_rows] = covariance.backoffs(theta)
+            question = case.question(i, ask.x, ask.target, ask.preview)
             mean = mean_optimum(problem, question, backoff)
             assert mean + covariance.cost(theta) == pytest.approx(answer.cost, rel=1e-6)
             checked += 1

@@ -1,4 +1,4 @@
-"""What is known ahead: a path, limits that move, and what gives way; against the same problem written in CVXPY."""
+"""Previews: a path, moving limits, and relaxed constraints; against the same problem in CVXPY."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def oracle(design: Design, part: Component, x: Array, target: Array, limits: Arr
     N, (n_x, n_u), n_w = H - tau, part.b.shape, part.e.shape[1]
     x, limits = x[part.states], limits[:, part.rows_x]
     x_path, u_path = path.states[:, part.states], path.inputs[:, part.inputs]
-    place, wanted = cp.Variable(part.x_eq.shape[1]), part.coordinates @ target[part.states]
+    place, expected = cp.Variable(part.x_eq.shape[1]), part.coordinates @ target[part.states]
     x_s, u_s = part.x_eq @ place, part.u_eq @ place
     v, slack = cp.Variable((N, n_u)), cp.Variable((N, len(part.c_x) // 2), nonneg=True)
     mean, effect = [x], [cp.Constant(np.zeros((n_x, H * n_w)))]
@@ -99,7 +99,7 @@ def oracle(design: Design, part: Component, x: Array, target: Array, limits: Arr
         effect.append(part.a @ effect[t] + part.b @ gains[t] + enter)
     stacked = cp.vstack(effect[N:])
     z = cp.vstack([effect[N][:, : N * n_w], *(gain[:, : N * n_w] for gain in gains[N:])])
-    cost += cp.sum_squares(half(part.p_xi) @ stacked) + design.offset_weight * cp.norm1(place - wanted)
+    cost += cp.sum_squares(half(part.p_xi) @ stacked) + design.offset_weight * cp.norm1(place - expected)
     cost += design.slack_linear * cp.sum(slack) + design.slack_quadratic * cp.sum_squares(slack)
     held = limits[N:].min(axis=0)
     rows = [mean[N] == x_s, cp.bmat([[stationary(part, tau), z], [z.T, np.eye(N * n_w)]]) >> 0]
@@ -149,11 +149,11 @@ def test_agrees_with_the_same_problem_written_in_cvxpy(x: Array, target: Array, 
     design, solver = paper_case()
     limits = constant_limits(design) if preview.limits is None else preview.limits
     path = no_path(design) if preview.path is None else preview.path
-    wanted = sum(oracle(design, part, x, target, limits, path) for part in decompose(design))
+    expected = sum(oracle(design, part, x, target, limits, path) for part in decompose(design))
     answer = solver.solve(0, x, target, preview)
     assert answer.status is SolveStatus.OPTIMAL
     assert answer.terminal_miss < 1e-6
-    assert answer.cost == pytest.approx(wanted, rel=1e-6)
+    assert answer.cost == pytest.approx(expected, rel=1e-6)
 
 
 def bits(answer: Answer) -> tuple[bytes, ...]:
@@ -185,12 +185,12 @@ def test_a_path_that_the_plant_can_fly_to_rest_is_flown_exactly() -> None:
 
 
 def check_told(design: Design, answer: Answer, limits: Array) -> None:
-    """What gave way is what the means and back-offs themselves say, row by row."""
+    """Relaxed constraints are those that means and back-offs violate, row by row."""
     rest = design.horizon - design.terminal.tau
     means = motion(design, answer.states[0], answer.inputs)
     assert answer.states == pytest.approx(means, rel=1e-9, abs=1e-9)
     excess = means @ design.state_set.c.T + answer.backoff_x - limits
-    wanted = {
+    expected = {
         ("state", t, i): excess[t, i]
         for t in range(1, design.horizon + 1)
         for i in range(excess.shape[1])
@@ -200,38 +200,38 @@ def check_told(design: Design, answer: Answer, limits: Array) -> None:
     for i, c in enumerate(design.state_set.c):
         over = c @ answer.reference + design.kappa_x_terminal * np.sqrt(c @ sigma @ c) - limits[rest:, i].min()
         if over > 1e-6:
-            wanted["terminal", rest, i] = over
+            expected["terminal", rest, i] = over
     for i, miss in enumerate(np.abs(means[rest] - answer.reference)):
         if miss > 1e-6:
-            wanted["equilibrium", rest, i] = miss
-    told = {(one.constraint, one.stage, one.index): one.amount for one in answer.relaxed}
-    assert set(told) == set(wanted)
-    for key, amount in told.items():
-        assert amount == pytest.approx(wanted[key], rel=1e-6, abs=1e-8)
+            expected["equilibrium", rest, i] = miss
+    reported = {(item.constraint, item.stage, item.index): item.amount for item in answer.relaxed}
+    assert set(reported) == set(expected)
+    for key, amount in reported.items():
+        assert amount == pytest.approx(expected[key], rel=1e-6, abs=1e-8)
 
 
 def kinds(answer: Answer) -> set[str]:
-    return {one.constraint for one in answer.relaxed}
+    return {item.constraint for item in answer.relaxed}
 
 
-def test_a_fence_that_shuts_the_drone_out_is_answered_and_told() -> None:
+def test_a_fence_around_another_place_has_an_answer_and_is_reported() -> None:
     design, solver = paper_case()
     row = row_of(design, 0, 1)
     limits = closing(design, 0, 1, np.full(13, 20.0))
     x = np.array([22.0, 0.0, 0.0, 0.0])
     answer = solver.solve(0, x, ORIGIN, Preview(limits=limits))
     assert answer.status is SolveStatus.OPTIMAL
-    assert {(one.constraint, one.index) for one in answer.relaxed} == {("state", row)}
-    assert {one.stage for one in answer.relaxed} == set(range(1, 1 + len(answer.relaxed)))
-    amounts = [one.amount for one in answer.relaxed]
+    assert {(item.constraint, item.index) for item in answer.relaxed} == {("state", row)}
+    assert {item.stage for item in answer.relaxed} == set(range(1, 1 + len(answer.relaxed)))
+    amounts = [item.amount for item in answer.relaxed]
     assert amounts == sorted(amounts, reverse=True)
     assert 1.5 < amounts[0] < 5.0
     assert answer.slack == pytest.approx(sum(amounts), abs=1e-5)
     check_told(design, answer, limits)
 
 
-def test_a_fence_around_nothing_is_answered_and_told() -> None:
-    """Upper limit below the lower one: no place to rest is left."""
+def test_an_empty_fence_has_an_answer_and_is_reported() -> None:
+    """Upper limit below the lower one: there is no place to rest."""
     design, solver = paper_case()
     limits = np.minimum(closing(design, 0, 1, np.full(13, -10.0)), closing(design, 0, -1, np.full(13, 5.0)))
     answer = solver.solve(0, START, ORIGIN, Preview(limits=limits))
@@ -240,7 +240,7 @@ def test_a_fence_around_nothing_is_answered_and_told() -> None:
     check_told(design, answer, limits)
 
 
-def test_a_target_out_of_reach_or_outside_gives_the_nearest_place_and_no_constraint_gives_way() -> None:
+def test_an_unreachable_target_gives_the_nearest_place_and_relaxes_nothing() -> None:
     design, solver = paper_case()
     for target in ([1000.0, 0.0, 0.0, 0.0], [49.9, 0.0, -24.9, 0.0]):
         answer = solver.solve(0, START, np.array(target), Preview())
@@ -251,7 +251,7 @@ def test_a_target_out_of_reach_or_outside_gives_the_nearest_place_and_no_constra
 
 
 @pytest.mark.parametrize("x", [[60.0, 0.0, 0.0, 0.0], [0.0, 40.0, 0.0, -30.0], [500.0, 20.0, -400.0, 0.0]], ids=str)
-def test_a_state_outside_the_box_is_answered_and_told(x: list[float]) -> None:
+def test_a_state_outside_the_box_has_an_answer_and_is_reported(x: list[float]) -> None:
     design, solver = paper_case()
     answer = solver.solve(0, np.array(x), ORIGIN)
     assert answer.status is SolveStatus.OPTIMAL
@@ -259,7 +259,7 @@ def test_a_state_outside_the_box_is_answered_and_told(x: list[float]) -> None:
     check_told(design, answer, constant_limits(design))
 
 
-def test_speed_that_no_stop_fits_misses_rest_and_tells_it() -> None:
+def test_a_speed_without_a_stop_misses_rest_and_is_reported() -> None:
     design, solver = paper_case()
     x = np.array([0.0, 400.0, 0.0, 0.0])
     answer = solver.solve(0, x, ORIGIN)
@@ -268,7 +268,7 @@ def test_speed_that_no_stop_fits_misses_rest_and_tells_it() -> None:
     check_told(design, answer, constant_limits(design))
 
 
-def test_in_a_room_everything_that_gives_way_is_told() -> None:
+def test_in_a_room_all_relaxed_constraints_are_reported() -> None:
     design, solver = room_case()
     limits = closing(design, 0, 1, np.linspace(-2.0, -2.8, 13))
     for x in (ROOM_CORNER, ROOM_CORNER + np.array([0.0, 1.4, 0, 0, 0, 0, 0, 0, 0])):
@@ -278,15 +278,15 @@ def test_in_a_room_everything_that_gives_way_is_told() -> None:
         check_told(design, answer, limits)
 
 
-def test_a_kept_plan_tells_nothing() -> None:
+def test_a_plan_that_keeps_all_constraints_reports_none() -> None:
     _, solver = paper_case()
     rng = np.random.default_rng(3)
-    seen = 0
+    observed = 0
     for x in rng.uniform(PAPER_LOWER, PAPER_UPPER, size=(20, 4)) * 0.5:
         answer = solver.solve(0, x, ORIGIN)
         assert (answer.relaxed == ()) == (max(answer.slack, answer.terminal_miss) <= 1e-6)
-        seen += answer.relaxed == ()
-    assert seen > 5
+        observed += answer.relaxed == ()
+    assert observed > 5
 
 
 def extremes(
@@ -306,7 +306,7 @@ def extremes(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "farthest"), [(250, 100.0), (50, 1e4)])
-def test_states_and_limits_far_beyond_sense_have_an_answer(count: int, farthest: float) -> None:
+def test_extreme_states_and_limits_have_an_answer(count: int, farthest: float) -> None:
     design, solver = paper_case()
     cases = extremes(design, PAPER_LOWER, PAPER_UPPER, count, farthest)
     endings = Counter(solver.solve(0, x, ORIGIN, preview).status for x, preview in cases)

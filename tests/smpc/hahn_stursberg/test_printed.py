@@ -1,4 +1,4 @@
-"""Problem (19) as printed: the paper's numbers, and honest endings."""
+"""Problem (19) as printed: the paper's numbers, and status values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uavctl.cli.design import make_solve_document, render_solution
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import decompose, whole
+from uavctl.smpc.hahn_stursberg.horizon import decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 
 
@@ -48,7 +48,7 @@ def test_plan_of_both_axes(solver: PrintedSolver) -> None:
     assert np.all(answer.backoff_u[:5] == 0.0)
 
 
-def test_nothing_is_certified_and_a_person_is_told_so(design: Design, solver: PrintedSolver) -> None:
+def test_nothing_is_certified_and_the_text_says_so(design: Design, solver: PrintedSolver) -> None:
     answer = solver.solve(0, START, ORIGIN)
     assert (answer.status, answer.cost_lower, answer.gap) == (SolveStatus.OPTIMAL, -np.inf, np.inf)
     shown = json.loads(msgspec.json.encode(make_solve_document(answer, 1.0)))
@@ -62,7 +62,7 @@ def test_nothing_is_certified_and_a_person_is_told_so(design: Design, solver: Pr
 
 @pytest.mark.slow
 def test_joint_problem_has_the_cost_of_its_axes(design: Design) -> None:
-    part = PrintedProblem(design, whole(design)).solve(START, ORIGIN)
+    part = PrintedProblem(design, make_whole_component(design)).solve(START, ORIGIN)
     assert part.status in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE)
     assert part.cost == pytest.approx(PAPER_COST, rel=2e-6)
 
@@ -78,7 +78,7 @@ def test_numbers_that_are_not_finite_fail(solver: PrintedSolver) -> None:
 
 
 @pytest.mark.parametrize("scale", [1e8, 1e20, 1e160, 1e300])
-def test_absurd_numbers_give_no_plan_and_no_exception(solver: PrintedSolver, scale: float) -> None:
+def test_extreme_numbers_give_no_plan_and_no_exception(solver: PrintedSolver, scale: float) -> None:
     answer = solver.solve(0, START * scale, ORIGIN)
     assert answer.status in (SolveStatus.FAILED, SolveStatus.INFEASIBLE)
     assert answer.inputs.size == 0
@@ -110,7 +110,7 @@ def test_an_interrupt_is_no_breakdown(solver: PrintedSolver, monkeypatch: pytest
 
 
 @pytest.mark.slow
-def test_iteration_limit_is_told() -> None:
+def test_iteration_limit_is_reported() -> None:
     assert PrintedSolver(paper(max_iterations=3)).solve(0, START, ORIGIN).status is SolveStatus.ITERATION_LIMIT
 
 

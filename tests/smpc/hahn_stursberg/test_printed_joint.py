@@ -1,4 +1,4 @@
-"""How the joint problem as printed ends in a general solver: recorded, because it decides what is compared."""
+"""Status of the joint problem as printed in a general solver, which decides what can be compared."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
-from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
+from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
 
 START = np.array([35.0, -2.0, -20.0, -4.0])
 
@@ -16,7 +16,7 @@ START = np.array([35.0, -2.0, -20.0, -4.0])
 @pytest.mark.slow
 def test_the_joint_form_does_not_end_optimal_under_the_solver_s_own_settings() -> None:
     design = build_design(load_config("paper"))
-    answer = PrintedSolver(design, joint=True, regularization=SOLVERS_OWN).solve(0, START, design.target)
+    answer = PrintedSolver(design, joint=True, regularization=CLARABEL_REGULARIZATION).solve(0, START, design.target)
     assert answer.status in (SolveStatus.INACCURATE, SolveStatus.FAILED)
 
 

@@ -1,4 +1,4 @@
-"""What every solver's answers have in common, whatever the numbers: one seeded sample each.
+"""Properties of all solvers' answers on seeded random samples.
 
 A comparison of two optima uses both bounds, `cost_lower` of the one that may not be the larger, so that it holds for
 solvers that certify a gap as well as for exact ones.
@@ -23,7 +23,7 @@ from uavctl.smpc.hahn_stursberg import exact as conic
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, kappa, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
-from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, horizon_of, whole
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, make_horizon, make_whole_component
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 
@@ -54,22 +54,22 @@ def states(count: int, seed: int, share: float = 0.8) -> list[Array]:
 
 def answers(kind: Kind, spec: DesignSpec, points: list[Array], target: Array = ORIGIN) -> list[Answer]:
     solver = kind.make(make_design(spec))
-    found = [solver.solve(0, x, target) for x in points]
-    assert {answer.status for answer in found} == {SolveStatus.OPTIMAL}
-    return found
+    result = [solver.solve(0, x, target) for x in points]
+    assert {answer.status for answer in result} == {SolveStatus.OPTIMAL}
+    return result
 
 
 def never_costs_more(kind: Kind, less: list[Answer], more: list[Answer]) -> None:
-    for one, other in zip(less, more, strict=True):
-        assert one.cost_lower <= other.cost * (1.0 + 1e-7)
-        assert one.cost <= other.cost * (1.0 + kind.cost)
+    for item, other in zip(less, more, strict=True):
+        assert item.cost_lower <= other.cost * (1.0 + 1e-7)
+        assert item.cost <= other.cost * (1.0 + kind.cost)
 
 
 # --- back-offs --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_backoffs_grow_with_the_age_of_what_is_known(kind: Kind) -> None:
+def test_backoffs_grow_with_the_age_of_the_information(kind: Kind) -> None:
     """Until the first feedback the state is known from stage 0 alone: its age is the stage."""
     for answer in answers(kind, paper_spec(), states(5, 1)):
         for before, after in pairwise(answer.backoff_x[:6]):
@@ -78,18 +78,18 @@ def test_backoffs_grow_with_the_age_of_what_is_known(kind: Kind) -> None:
 
 
 def test_backoffs_grow_with_the_age_of_the_base() -> None:
-    """With the same gains on the disturbances since now, every older base knows less."""
+    """With the same gains on the disturbances since now, an older base has less information."""
     design = paper()
     rng = np.random.default_rng(2)
     for part in decompose(design):
-        new = horizon_of(design, part)
+        new = make_horizon(design, part)
         theta = 0.1 * rng.normal(size=new.n_theta)
         sizes = []
         for past in range(4):
             old = Horizon(part, design.horizon, design.terminal.tau, design.schedule, past)
             same = dict(zip(new.gains, theta, strict=True))
             gains = np.array([same.get(gain, 0.0) for gain in old.gains])
-            noises = [old.state_noise(t, part.c_x).at(gains) for t in range(1, design.horizon + 1)]
+            noises = [old.state_noise(t, part.c_x).evaluate(gains) for t in range(1, design.horizon + 1)]
             sizes.append([np.linalg.norm(noise.reshape(len(part.c_x), -1), axis=1) for noise in noises])
         for newer, older in pairwise(np.array(sizes)):
             assert np.all(older > newer)
@@ -105,8 +105,8 @@ def test_backoffs_grow_with_loss(kind: Kind) -> None:
         assert np.all(design.kappa_x[6:] > better.kappa_x[6:])
         assert np.all(design.kappa_u[5:] > better.kappa_u[5:])
     for low, high in pairwise(worse):
-        for one, other in zip(low, high, strict=True):
-            assert np.all(other.backoff_x[1:6] >= one.backoff_x[1:6])  # no feedback there: κ is all that changes
+        for item, other in zip(low, high, strict=True):
+            assert np.all(other.backoff_x[1:6] >= item.backoff_x[1:6])  # no feedback there: κ is all that changes
 
 
 # --- cost -------------------------------------------------------------------------------------------------------------
@@ -179,10 +179,10 @@ def test_longer_delays_never_cost_less(kind: Kind) -> None:
 def test_mirrored_states_give_mirrored_plans(kind: Kind) -> None:
     solver = kind.make(make_design(paper_spec(state_set=SYMMETRIC)))
     for x in states(6, 8):
-        one, other = solver.solve(0, x, ORIGIN), solver.solve(0, -x, ORIGIN)
-        assert one.inputs == pytest.approx(-other.inputs, abs=kind.plan)
-        assert one.backoff_x == pytest.approx(other.backoff_x, abs=10 * kind.plan)
-        assert one.cost == pytest.approx(other.cost, rel=kind.cost)
+        item, other = solver.solve(0, x, ORIGIN), solver.solve(0, -x, ORIGIN)
+        assert item.inputs == pytest.approx(-other.inputs, abs=kind.plan)
+        assert item.backoff_x == pytest.approx(other.backoff_x, abs=10 * kind.plan)
+        assert item.cost == pytest.approx(other.cost, rel=kind.cost)
 
 
 @pytest.mark.slow
@@ -190,33 +190,33 @@ def test_axes_of_the_same_kind_may_be_swapped(kind: Kind) -> None:
     solver = kind.make(make_design(paper_spec(state_set=Polytope.from_box([-30.0, -8.0] * 2, [30.0, 8.0] * 2))))
     swap = [2, 3, 0, 1]
     for x in states(4, 9):
-        one, other = solver.solve(0, x, ORIGIN), solver.solve(0, x[swap], ORIGIN)
-        assert one.inputs == pytest.approx(other.inputs[:, ::-1], abs=kind.plan)
-        assert one.cost == pytest.approx(other.cost, rel=kind.cost)
+        item, other = solver.solve(0, x, ORIGIN), solver.solve(0, x[swap], ORIGIN)
+        assert item.inputs == pytest.approx(other.inputs[:, ::-1], abs=kind.plan)
+        assert item.cost == pytest.approx(other.cost, rel=kind.cost)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("move_m", [(100.0, 0.0), (-3.0, 2000.0), (1e5, -1e5)], ids=str)
-def test_moving_everything_moves_the_plan_along(kind: Kind, move_m: tuple[float, float]) -> None:
+def test_a_shift_of_everything_shifts_the_plan(kind: Kind, move_m: tuple[float, float]) -> None:
     move = np.array([move_m[0], 0.0, move_m[1], 0.0])
     spec = paper_spec()
-    moved = replace(
+    shifted = replace(
         spec, state_set=replace(spec.state_set, b=spec.state_set.b + spec.state_set.c @ move), target_m=(*move_m, 0.0)
     )
     points = states(5, 10)
     here = answers(kind, spec, points)
-    there = answers(kind, moved, [x + move for x in points], move)
-    for one, other in zip(here, there, strict=True):
-        assert one.inputs == pytest.approx(other.inputs, abs=kind.plan)
-        assert one.states == pytest.approx(other.states - move, abs=10 * kind.plan)
-        assert one.cost == pytest.approx(other.cost, rel=kind.cost)
+    there = answers(kind, shifted, [x + move for x in points], move)
+    for item, other in zip(here, there, strict=True):
+        assert item.inputs == pytest.approx(other.inputs, abs=kind.plan)
+        assert item.states == pytest.approx(other.states - move, abs=10 * kind.plan)
+        assert item.cost == pytest.approx(other.cost, rel=kind.cost)
 
 
 def test_the_step_s_number_changes_nothing(kind: Kind) -> None:
     solver = kind.make(paper())
-    one, other = solver.solve(0, START, ORIGIN), solver.solve(12345, START, ORIGIN)
-    assert one.inputs.tobytes() == other.inputs.tobytes()
-    assert (one.seq, other.seq, one.cost) == (0, 12345, other.cost)
+    item, other = solver.solve(0, START, ORIGIN), solver.solve(12345, START, ORIGIN)
+    assert item.inputs.tobytes() == other.inputs.tobytes()
+    assert (item.seq, other.seq, item.cost) == (0, 12345, other.cost)
 
 
 @pytest.mark.slow
@@ -226,11 +226,11 @@ def test_a_change_of_units_changes_nothing(kind: Kind, units: tuple[float, float
     points = states(5, 11, 1.2)  # some beyond the limits
     here = answers(kind, spec, points)
     there = answers(kind, in_units(spec, changed), [x * changed.state for x in points], ORIGIN)
-    for one, other in zip(here, there, strict=True):
-        assert one.inputs == pytest.approx(other.inputs / changed.input, abs=kind.plan)
-        assert one.states == pytest.approx(other.states / changed.state, abs=10 * kind.plan)
-        assert one.cost == pytest.approx(other.cost / changed.cost, rel=kind.cost)
-        assert one.slack == pytest.approx(other.slack / changed.state[0], abs=1e-4)
+    for item, other in zip(here, there, strict=True):
+        assert item.inputs == pytest.approx(other.inputs / changed.input, abs=kind.plan)
+        assert item.states == pytest.approx(other.states / changed.state, abs=10 * kind.plan)
+        assert item.cost == pytest.approx(other.cost / changed.cost, rel=kind.cost)
+        assert item.slack == pytest.approx(other.slack / changed.state[0], abs=1e-4)
 
 
 # --- coupling ---------------------------------------------------------------------------------------------------------
@@ -240,20 +240,20 @@ def test_a_change_of_units_changes_nothing(kind: Kind, units: tuple[float, float
 def test_hardly_coupled_axes_have_the_plan_of_independent_ones(kind: Kind) -> None:
     """One component of two axes, whose coupling does nothing, against two components."""
     joint = make_design(paper_spec(plant=paper_plant(coupling=1e-10)))
-    apart = paper()
-    assert (len(decompose(joint)), len(decompose(apart))) == (1, 2)
-    together, alone = kind.make(joint), kind.make(apart)
+    difference = paper()
+    assert (len(decompose(joint)), len(decompose(difference))) == (1, 2)
+    together, single = kind.make(joint), kind.make(difference)
     for x in states(3, 12):
-        one, other = together.solve(0, x, ORIGIN), alone.solve(0, x, ORIGIN)
-        assert one.cost == pytest.approx(other.cost, rel=kind.cost)
-        assert one.inputs == pytest.approx(other.inputs, abs=10 * kind.plan)
-        assert one.states == pytest.approx(other.states, abs=10 * kind.plan)
+        item, other = together.solve(0, x, ORIGIN), single.solve(0, x, ORIGIN)
+        assert item.cost == pytest.approx(other.cost, rel=kind.cost)
+        assert item.inputs == pytest.approx(other.inputs, abs=10 * kind.plan)
+        assert item.states == pytest.approx(other.states, abs=10 * kind.plan)
 
 
 @pytest.mark.parametrize("name", ["calm axis, W = 0", "calm axis, no column"])
 def test_the_whole_plant_as_one_part_has_the_cost_of_its_parts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     made = case(name)
-    monkeypatch.setattr(conic, "decompose", lambda design: (whole(design),))
+    monkeypatch.setattr(conic, "decompose", lambda design: (make_whole_component(design),))
     together = ConicSolver(made.design).solve(0, made.x, made.design.target)
     assert kept(together)
     assert together.cost == pytest.approx(made.answer.cost, rel=1e-7)

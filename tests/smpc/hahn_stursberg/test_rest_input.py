@@ -1,4 +1,4 @@
-"""Redundant inputs: Assumption 4.4 is checked at the rest input that plans use, the cheapest, and at no other."""
+"""Redundant inputs: Assumption 4.4 is checked at the cheapest rest input, which plans use."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def spring(rng: np.random.Generator) -> Model:
     return Model(f, g, np.array([[0.0], [1.0]]), np.array([[0.002]]), (0,), (1,))
 
 
-def asked(sides: list[float], target_m: tuple[float, float, float] = PLACE_M) -> DesignSpec:
+def requested(sides: list[float], target_m: tuple[float, float, float] = PLACE_M) -> DesignSpec:
     return replace(
         spec_of(Shape("spring", spring, horizon=8, tau=1, seed=3)),
         q_u=np.diag([100.0, 1.0]),
@@ -40,49 +40,49 @@ def asked(sides: list[float], target_m: tuple[float, float, float] = PLACE_M) ->
     )
 
 
-def at_place(given: DesignSpec) -> Answer:
-    design = make_design(given)
-    x = given.plant.equilibrium(PLACE_M)
+def at_place(case: DesignSpec) -> Answer:
+    design = make_design(case)
+    x = case.plant.equilibrium(PLACE_M)
     return ConicSolver(design).solve(0, x, x)
 
 
-def some_rest_fits(given: DesignSpec) -> bool:
+def some_rest_fits(case: DesignSpec) -> bool:
     """Whether any input holds the target within the limits."""
-    x = given.plant.equilibrium(PLACE_M)
-    limits = list(zip(*np.split(given.input_set.b, 2), strict=True))
-    found = linprog(
-        np.zeros(2), A_eq=given.plant.b, b_eq=x - given.plant.a @ x, bounds=[(-lower, upper) for upper, lower in limits]
+    x = case.plant.equilibrium(PLACE_M)
+    limits = list(zip(*np.split(case.input_set.b, 2), strict=True))
+    result = linprog(
+        np.zeros(2), A_eq=case.plant.b, b_eq=x - case.plant.a @ x, bounds=[(-lower, upper) for upper, lower in limits]
     )
-    return bool(found.status == 0)
+    return bool(result.status == 0)
 
 
 def test_the_rest_input_is_the_cheapest() -> None:
-    given = asked(FITS_CHEAPEST)
-    x, (a, b) = given.plant.equilibrium(PLACE_M), (given.plant.a, given.plant.b)
-    found = find_rest_input(a, b, given.q_u, x)
-    assert found == pytest.approx(CHEAPEST, rel=1e-9)
-    assert a @ x + b @ found == pytest.approx(x, rel=1e-9, abs=1e-12)
+    case = requested(FITS_CHEAPEST)
+    x, (a, b) = case.plant.equilibrium(PLACE_M), (case.plant.a, case.plant.b)
+    result = find_rest_input(a, b, case.q_u, x)
+    assert result == pytest.approx(CHEAPEST, rel=1e-9)
+    assert a @ x + b @ result == pytest.approx(x, rel=1e-9, abs=1e-12)
 
 
 def test_a_target_that_the_cheapest_rest_input_holds_is_accepted_and_held() -> None:
-    given = asked(FITS_CHEAPEST)
-    answer = at_place(given)
+    case = requested(FITS_CHEAPEST)
+    answer = at_place(case)
     assert answer.offset < 1e-6 and answer.slack < 1e-6
     assert answer.inputs[-1] == pytest.approx(CHEAPEST, rel=1e-5)
-    design = make_design(given)
+    design = make_design(case)
     (item,) = [check for check in design.assumptions if check.item == "4.4"]
     assert item.ok and item.limit == pytest.approx(min(0.5 - CHEAPEST[0], 2.6 - CHEAPEST[1]), rel=1e-9)
 
 
-def test_a_target_that_only_dearer_rest_inputs_hold_is_refused_for_no_plan_would_rest_there() -> None:
-    given = asked(FITS_SMALLEST)
-    assert some_rest_fits(given)
+def test_a_target_that_only_more_expensive_inputs_hold_is_refused() -> None:
+    case = requested(FITS_SMALLEST)
+    assert some_rest_fits(case)
     with pytest.raises(DesignError, match=r"Assumption 4\.4 fails.*upper limit of input 1"):
-        make_design(given)
-    kappa_x, kappa_u = terminal_factors(given)
-    x = given.plant.equilibrium(PLACE_M)
-    limits = (given.state_set, given.input_set, x, kappa_x, kappa_u)
+        make_design(case)
+    kappa_x, kappa_u = terminal_factors(case)
+    x = case.plant.equilibrium(PLACE_M)
+    limits = (case.state_set, case.input_set, x, kappa_x, kappa_u)
     with pytest.raises(DesignError, match="leaves no room"):
-        synthesize(given.plant, given.tau, given.q_x, given.q_u, *limits)
+        synthesize(case.plant, case.tau, case.q_x, case.q_u, *limits)
     # From a design for another target: the plan ends as near as its rest input allows.
-    assert at_place(asked(FITS_SMALLEST, (0.0, 0.0, 0.0))).offset > 0.1
+    assert at_place(requested(FITS_SMALLEST, (0.0, 0.0, 0.0))).offset > 0.1

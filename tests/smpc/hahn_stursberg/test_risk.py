@@ -1,4 +1,4 @@
-"""Risk allocation: quantiles against their definitions, and what each costs on the paper's example."""
+"""Risk allocation: quantiles against their definitions, and their cost on the paper's example."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_the_ellipsoid_holds_the_whole_likelihood(gamma: float) -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9, -0.99])
-def test_half_spaces_hold_whatever_the_correlation(correlation: float) -> None:
+def test_half_spaces_hold_for_any_correlation(correlation: float) -> None:
     """Boole: at most the sum of the single risks is lost, and they add up to 1 - gamma."""
     gamma, rows = 0.9, 4
     factor = kappa(gamma, 2, rows, "halfspace")
@@ -35,7 +35,7 @@ def test_half_spaces_hold_whatever_the_correlation(correlation: float) -> None:
 
 
 def test_the_ellipsoid_costs_more_than_half_spaces() -> None:
-    """Each with the schedule of the printed one, from the printed state."""
+    """Each allocation with the printed schedule, from the printed state."""
     delays = make_design(spec("paper")).schedule.delays
     made = [make_design(spec("paper", rule="fixed", delays=delays, allocation=name)) for name in get_args(Allocation)]
     assert [design.kappa_x_terminal for design in made] == pytest.approx([3.2306, 2.6347], abs=1e-4)

@@ -1,4 +1,4 @@
-"""Units change nothing, tolerances mean what they say, and far states have answers."""
+"""Units change nothing, tolerances hold, and far states have answers."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from uavctl.smpc.sets import equilibrate
 SHORT = [shape.name for shape in SHAPES if shape.horizon <= 12]
 
 
-def difference(one: Array, other: Array) -> float:
+def difference(item: Array, other: Array) -> float:
     """Largest difference as a share of the largest number."""
-    return float(np.abs(one - other).max() / max(float(np.abs(other).max()), 1e-300))
+    return float(np.abs(item - other).max() / max(float(np.abs(other).max()), 1e-300))
 
 
 # --- units ------------------------------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ def test_a_change_of_units_changes_nothing(name: str) -> None:
 @pytest.mark.parametrize(
     ("state", "input", "cost"), [(1e3, 1, 1), (1e-3, 1, 1), (1, 1e-3, 1), (1, 1, 1e6), (1, 1, 1e-6)]
 )
-def test_each_unit_by_itself(state: float, input: float, cost: float) -> None:
+def test_each_unit_alone(state: float, input: float, cost: float) -> None:
     for name in ("coupled 0", "H = 20, tau = 10"):
         same_plan(name, Units.of(case(name).design.plant, state, input, cost))
 
@@ -68,17 +68,17 @@ def test_prices_are_per_unit_and_are_converted_with_it(seed: int) -> None:
     assert converted.slack_linear == pytest.approx(spec.slack_linear * units.cost / units.state[0])
     here, there = ConicSolver(make_design(spec)), ConicSolver(make_design(converted))
     for x in (np.array([0.0, 14.0, 0.0, 0.0]), np.array([80.0, 60.0, -3.0, 1.0]), np.array([30.0, 5.0, -40.0, -9.0])):
-        one, other = here.solve(0, x, ORIGIN), there.solve(0, x * units.state, ORIGIN)
-        assert {one.status, other.status} == {SolveStatus.OPTIMAL}
-        assert one.slack + one.terminal_miss > 0.1
-        assert other.cost / units.cost == pytest.approx(one.cost, rel=1e-7)
+        item, other = here.solve(0, x, ORIGIN), there.solve(0, x * units.state, ORIGIN)
+        assert {item.status, other.status} == {SolveStatus.OPTIMAL}
+        assert item.slack + item.terminal_miss > 0.1
+        assert other.cost / units.cost == pytest.approx(item.cost, rel=1e-7)
         assert (other.slack + other.terminal_miss) / units.state[0] == pytest.approx(
-            one.slack + one.terminal_miss, rel=1e-5
+            item.slack + item.terminal_miss, rel=1e-5
         )
-        assert difference(other.inputs / units.input, one.inputs) < 1e-5
+        assert difference(other.inputs / units.input, item.inputs) < 1e-5
 
 
-def test_equilibrated_matrices_have_unit_rows_and_columns_whatever_their_units() -> None:
+def test_equilibrated_matrices_have_unit_rows_and_columns_in_any_units() -> None:
     rng = np.random.default_rng(1)
     matrix = rng.normal(size=(4, 3)) * 10.0 ** rng.uniform(-6, 6, (4, 1)) * 10.0 ** rng.uniform(-6, 6, 3)
     matrix[2] = 0.0
@@ -94,10 +94,10 @@ def test_parts_of_a_step_are_exact_in_any_units() -> None:
     other = replace(
         plant, a=scale[:, None] * plant.a / scale, b=1e4 * scale[:, None] * plant.b, e=scale[:, None] * plant.e
     )
-    for one, two in zip(plant.transition(0.4 * plant.dt_s), other.transition(0.4 * plant.dt_s), strict=True):
+    for item, two in zip(plant.transition(0.4 * plant.dt_s), other.transition(0.4 * plant.dt_s), strict=True):
         factor = scale[:, None] if two.shape[1] != 4 else scale[:, None] / scale
         factor = 1e4 * factor if two.shape[1] == 1 else factor
-        np.testing.assert_allclose(two / factor, one, atol=1e-11)
+        np.testing.assert_allclose(two / factor, item, atol=1e-11)
 
 
 # --- tolerances and far states ----------------------------------------------------------------------------------------
@@ -131,8 +131,8 @@ def test_states_up_to_a_million_times_outside_have_an_answer(design: Design, x: 
         assert answer.terminal_miss > 1.0
         assert answer.relaxed
         # At full thrust against the way it has to go.
-        moved = answer.inputs[0] * (target - x)[list(design.plant.position_index)]
-        assert moved[0] > 0.0
+        shifted = answer.inputs[0] * (target - x)[list(design.plant.position_index)]
+        assert shifted[0] > 0.0
 
 
 def test_a_target_far_away_is_approached() -> None:
@@ -144,11 +144,11 @@ def test_a_target_far_away_is_approached() -> None:
         assert answer.reference == pytest.approx(near.reference, abs=1e-3)
 
 
-def test_a_hard_answer_is_the_same_wherever_the_numbers_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The origin that large numbers are relative to is no part of the problem."""
+def test_a_hard_answer_is_the_same_for_any_origin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The origin of large numbers is not part of the problem."""
     made = case("coupled 0")
     monkeypatch.setattr("uavctl.smpc.sets._USUAL_SIZES", 0.0)
-    moved = ConicSolver(made.design).solve(0, made.x, made.design.target)
-    assert kept(moved)
-    assert moved.cost == pytest.approx(made.answer.cost, rel=1e-7)
-    assert difference(moved.inputs, made.answer.inputs) < 1e-4
+    shifted = ConicSolver(made.design).solve(0, made.x, made.design.target)
+    assert kept(shifted)
+    assert shifted.cost == pytest.approx(made.answer.cost, rel=1e-7)
+    assert difference(shifted.inputs, made.answer.inputs) < 1e-4

@@ -1,4 +1,4 @@
-"""Synthesis of the terminal gain: known optima, gradients, grids, limits that bind, and what is refused."""
+"""Synthesis of the terminal gain: known optima, gradients, grids, active limits, and refusals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule
 from uavctl.smpc.hahn_stursberg.synthesis import (
-    MOST_FILLED,
+    MAX_FILLED,
     DelayedLoop,
     Synthesis,
     Weight,
@@ -29,11 +29,11 @@ from uavctl.smpc.sets import Polytope
 INF = np.inf
 
 
-def synthesized(given: DesignSpec, start: Array | None = None) -> Synthesis:
-    kappa_x, kappa_u = terminal_factors(given)
-    target = given.plant.equilibrium(given.target_m)
+def synthesized(case: DesignSpec, start: Array | None = None) -> Synthesis:
+    kappa_x, kappa_u = terminal_factors(case)
+    target = case.plant.equilibrium(case.target_m)
     return synthesize(
-        given.plant, given.tau, given.q_x, given.q_u, given.state_set, given.input_set, target, kappa_x, kappa_u, start
+        case.plant, case.tau, case.q_x, case.q_u, case.state_set, case.input_set, target, kappa_x, kappa_u, start
     )
 
 
@@ -53,7 +53,7 @@ def axis(a: Any, b: Any, e: Any, w: float = 1.0) -> Plant:
     )
 
 
-def least(plant: Plant, tau: int, q_x: Array, q_u: Array, start: Array | None = None, **limits: Any) -> Synthesis:
+def minimum(plant: Plant, tau: int, q_x: Array, q_u: Array, start: Array | None = None, **limits: Any) -> Synthesis:
     """Without limits unless some are given: half-widths of symmetric boxes, for a κ of 1."""
     box_x, box_u = limits.get("x", [INF] * plant.n_x), limits.get("u", [INF] * plant.n_u)
     return synthesize(
@@ -82,31 +82,31 @@ def random_loop(seed: int) -> tuple[DelayedLoop, Weight, Array]:
 
 
 def test_the_paper_s_gain_of_least_cost() -> None:
-    given = spec("paper")
-    found = synthesized(given, given.k_tau)
-    np.testing.assert_allclose(found.k, np.kron(np.eye(2), [[-0.152, -0.787]]), atol=5e-4)
-    assert found.cost / 2 == pytest.approx(162.0, abs=0.05)
-    before = make_terminal(given.plant, given.tau, given.k_tau, given.q_x, given.q_u)
+    case = spec("paper")
+    result = synthesized(case, case.k_tau)
+    np.testing.assert_allclose(result.k, np.kron(np.eye(2), [[-0.152, -0.787]]), atol=5e-4)
+    assert result.cost / 2 == pytest.approx(162.0, abs=0.05)
+    before = make_terminal(case.plant, case.tau, case.k_tau, case.q_x, case.q_u)
     assert stationary_cost(before) / 2 == pytest.approx(258.6, abs=0.05)
 
 
 def test_the_room_s_gain_is_the_best_one() -> None:
-    given = spec("room-hahn-stursberg")
-    found = synthesized(given)  # from starts of its own
-    np.testing.assert_allclose(found.k, given.k_tau, atol=5e-4)
+    case = spec("room-hahn-stursberg")
+    result = synthesized(case)  # from starts of its own
+    np.testing.assert_allclose(result.k, case.k_tau, atol=5e-4)
 
 
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_the_figures_are_those_of_the_lifted_system(name: str) -> None:
-    given = spec(name)
-    found = synthesized(given)
-    terminal = make_terminal(given.plant, given.tau, found.k, given.q_x, given.q_u)
-    assert found.cost == pytest.approx(stationary_cost(terminal), rel=1e-9)
-    assert found.spectral_radius == pytest.approx(terminal.spectral_radius, rel=1e-6)
-    design = make_design(replace(given, k_tau=found.k))
+    case = spec(name)
+    result = synthesized(case)
+    terminal = make_terminal(case.plant, case.tau, result.k, case.q_x, case.q_u)
+    assert result.cost == pytest.approx(stationary_cost(terminal), rel=1e-9)
+    assert result.spectral_radius == pytest.approx(terminal.spectral_radius, rel=1e-6)
+    design = make_design(replace(case, k_tau=result.k))
     shares = {check.item: check.value / check.limit for check in design.assumptions}
-    assert found.filled_x == pytest.approx(shares["4.3"], rel=1e-9)
-    assert found.filled_u == pytest.approx(shares["4.4"], rel=1e-9)
+    assert result.filled_x == pytest.approx(shares["4.3"], rel=1e-9)
+    assert result.filled_u == pytest.approx(shares["4.4"], rel=1e-9)
     assert check_schedule(design) > 0
 
 
@@ -134,7 +134,7 @@ def test_gradient_is_that_of_finite_differences(seed: int, discount: float) -> N
 @pytest.mark.parametrize("tau", [1, 2, 5])
 def test_no_gain_of_a_grid_is_better(tau: int) -> None:
     plant, q_x, q_u = one_axis(paper_plant()), np.diag([10.0, 0.1]), np.array([[0.1]])
-    found = least(plant, tau, q_x, q_u)
+    result = minimum(plant, tau, q_x, q_u)
     costs = []
     for position in np.linspace(-1.0, 0.0, 41):
         for velocity in np.linspace(-2.5, 0.5, 41):
@@ -143,8 +143,8 @@ def test_no_gain_of_a_grid_is_better(tau: int) -> None:
             except DesignError:  # unstable
                 continue
             costs.append(stationary_cost(terminal))
-    assert found.cost <= min(costs)
-    assert found.cost == pytest.approx(min(costs), rel=0.02)
+    assert result.cost <= min(costs)
+    assert result.cost == pytest.approx(min(costs), rel=0.02)
 
 
 def test_a_delayed_integrator_against_its_closed_form() -> None:
@@ -154,9 +154,9 @@ def test_a_delayed_integrator_against_its_closed_form() -> None:
         return (1.0 - k) / ((1.0 + k) * ((1.0 - k) ** 2 - 1.0)) * (1.0 + 0.5 * k * k)
 
     best = minimize_scalar(cost, bounds=(-0.999, -0.001), method="bounded", options={"xatol": 1e-12})
-    found = least(axis([[1.0]], [[1.0]], [[1.0]]), 1, np.eye(1), 0.5 * np.eye(1))
-    assert found.k[0, 0] == pytest.approx(best.x, abs=1e-6)
-    assert found.cost == pytest.approx(best.fun, rel=1e-10)
+    result = minimum(axis([[1.0]], [[1.0]], [[1.0]]), 1, np.eye(1), 0.5 * np.eye(1))
+    assert result.k[0, 0] == pytest.approx(best.x, abs=1e-6)
+    assert result.cost == pytest.approx(best.fun, rel=1e-10)
 
 
 @pytest.mark.slow
@@ -166,10 +166,10 @@ def test_limits_that_bind(side: str, room: list[float]) -> None:
     if side == "x" and room[0] < INF:
         q_u = np.array([[500.0]])  # so dear that the position would rather stray
     limits: Any = {side: room}
-    free, bound = least(plant, tau, q_x, q_u), least(plant, tau, q_x, q_u, **limits)
+    free, bound = minimum(plant, tau, q_x, q_u), minimum(plant, tau, q_x, q_u, **limits)
     filled = bound.filled_u if side == "u" else bound.filled_x
-    assert filled == pytest.approx(MOST_FILLED, abs=1e-6)
-    assert filled <= MOST_FILLED + 1e-6
+    assert filled == pytest.approx(MAX_FILLED, abs=1e-6)
+    assert filled <= MAX_FILLED + 1e-6
     assert free.cost < bound.cost
     # No gain of a grid around it that fits is better.
     for position in bound.k[0, 0] * np.linspace(0.7, 1.3, 25):
@@ -180,38 +180,38 @@ def test_limits_that_bind(side: str, room: list[float]) -> None:
             except DesignError:  # unstable
                 continue
             variance = k @ terminal.sigma_x @ k.T if side == "u" else terminal.sigma_x
-            if np.all(np.sqrt(np.diag(variance)) <= MOST_FILLED * np.array(room)):
+            if np.all(np.sqrt(np.diag(variance)) <= MAX_FILLED * np.array(room)):
                 assert stationary_cost(terminal) >= bound.cost * (1.0 - 1e-6)
 
 
 def test_a_design_with_a_gain_at_its_limits_is_complete() -> None:
-    given = spec("paper", input_set=Polytope.from_box([-2.5] * 2, [2.5] * 2))
-    found = synthesized(given, given.k_tau)
-    assert found.filled_u == pytest.approx(MOST_FILLED, abs=1e-6)
-    design = make_design(replace(given, k_tau=found.k))
+    case = spec("paper", input_set=Polytope.from_box([-2.5] * 2, [2.5] * 2))
+    result = synthesized(case, case.k_tau)
+    assert result.filled_u == pytest.approx(MAX_FILLED, abs=1e-6)
+    design = make_design(replace(case, k_tau=result.k))
     assert check_schedule(design) > 0
 
 
 def test_of_two_sides_the_nearer_one_counts() -> None:
     dear = spec("paper", q_u=500.0 * np.eye(2))
-    given = replace(dear, target_m=(0.0, 5.0, 0.0))  # 15 from its upper limit, 30 from the lower
-    near = synthesized(given)
-    design = make_design(replace(given, k_tau=near.k))
+    case = replace(dear, target_m=(0.0, 5.0, 0.0))  # 15 from its upper limit, 30 from the lower
+    near = synthesized(case)
+    design = make_design(replace(case, k_tau=near.k))
     (check,) = (check for check in design.assumptions if check.item == "4.3")
     assert check.limit == pytest.approx(15.0)
-    assert near.filled_x == pytest.approx(MOST_FILLED, abs=1e-6)
+    assert near.filled_x == pytest.approx(MAX_FILLED, abs=1e-6)
     # only the axis that the limit is in gives way
     np.testing.assert_allclose(near.k[0], synthesized(dear).k[0], rtol=1e-5)
     assert near.k[1, 2] != pytest.approx(near.k[0, 0], rel=0.01)
 
 
 def test_the_same_task_gives_the_same_bits_and_the_start_does_not_matter() -> None:
-    given = spec("paper")
-    first = synthesized(given)
+    case = spec("paper")
+    first = synthesized(case)
     synthesized(spec("room-hahn-stursberg"))
-    np.testing.assert_array_equal(synthesized(given).k, first.k)
-    for start in (given.k_tau, 0.1 * given.k_tau, 20.0 * given.k_tau):  # the last one is unstable
-        assert synthesized(given, start).cost == pytest.approx(first.cost, rel=1e-9)
+    np.testing.assert_array_equal(synthesized(case).k, first.k)
+    for start in (case.k_tau, 0.1 * case.k_tau, 20.0 * case.k_tau):  # the last one is unstable
+        assert synthesized(case, start).cost == pytest.approx(first.cost, rel=1e-9)
 
 
 def test_a_change_of_units_changes_nothing() -> None:
@@ -219,8 +219,8 @@ def test_a_change_of_units_changes_nothing() -> None:
     unit_x, unit_u = np.diag([1e3, 0.01]), 50.0  # of the new numbers, per old one
     back = np.linalg.inv(unit_x)
     other = replace(plant, a=unit_x @ plant.a @ back, b=unit_x @ plant.b / unit_u, e=unit_x @ plant.e)
-    old = least(plant, 4, q_x, q_u, u=[0.5])
-    new = least(other, 4, back @ q_x @ back, q_u / unit_u**2, u=[0.5 * unit_u])
+    old = minimum(plant, 4, q_x, q_u, u=[0.5])
+    new = minimum(other, 4, back @ q_x @ back, q_u / unit_u**2, u=[0.5 * unit_u])
     assert new.cost == pytest.approx(old.cost, rel=1e-8)
     np.testing.assert_allclose(new.k, unit_u * old.k @ back, rtol=1e-4)
 
@@ -234,13 +234,13 @@ def test_random_coupled_plants_end_at_a_minimum(seed: int) -> None:
     if np.any((np.abs(np.linalg.eigvals(a).imag) < 1e-9) & (np.linalg.eigvals(a).real <= 1e-9)):
         a = a + 0.05 * np.eye(3)
     plant = Plant(a, loop.b, e, np.eye(3), 1.0, ("north", "east"), (0, 1), (1, 2), np.ones(2))
-    found = least(plant, loop.tau, weight.x, weight.u, k)
-    at = DelayedLoop(plant.a, plant.b, e @ e.T, loop.tau).stationary(found.k)
+    result = minimum(plant, loop.tau, weight.x, weight.u, k)
+    at = DelayedLoop(plant.a, plant.b, e @ e.T, loop.tau).stationary(result.k)
     assert at is not None
-    scale = np.abs(found.k).max() / found.cost
+    scale = np.abs(result.k).max() / result.cost
     assert np.abs(at.gradient(weight)).max() * scale < 1e-5
     for start in (k, np.zeros((2, 3))):
-        assert found.cost <= stationary_cost(make_terminal(plant, loop.tau, start, weight.x, weight.u))
+        assert result.cost <= stationary_cost(make_terminal(plant, loop.tau, start, weight.x, weight.u))
 
 
 def test_coupled_axes_get_a_coupled_gain_that_is_worth_it() -> None:
@@ -250,58 +250,58 @@ def test_coupled_axes_get_a_coupled_gain_that_is_worth_it() -> None:
         a[1, 3] = a[3, 1] = by
         return replace(plant, a=a)
 
-    given = spec("paper")
+    case = spec("paper")
     plant = coupled(0.1)
-    found = synthesized(replace(given, plant=plant), given.k_tau)
-    blocks = np.kron(np.eye(2), np.ones((1, 2))) * found.k
-    assert np.all(found.k != 0.0)
-    assert found.cost < stationary_cost(make_terminal(plant, 4, blocks, given.q_x, given.q_u))
-    apart = synthesized(given)
-    assert np.count_nonzero(apart.k) == 4
-    np.testing.assert_allclose(synthesized(replace(given, plant=coupled(1e-7))).k, apart.k, atol=1e-4)
+    result = synthesized(replace(case, plant=plant), case.k_tau)
+    blocks = np.kron(np.eye(2), np.ones((1, 2))) * result.k
+    assert np.all(result.k != 0.0)
+    assert result.cost < stationary_cost(make_terminal(plant, 4, blocks, case.q_x, case.q_u))
+    difference = synthesized(case)
+    assert np.count_nonzero(difference.k) == 4
+    np.testing.assert_allclose(synthesized(replace(case, plant=coupled(1e-7))).k, difference.k, atol=1e-4)
 
 
 def test_an_undisturbed_axis_keeps_its_gain() -> None:
-    given = spec("paper")
-    plant = replace(given.plant, w=np.diag([0.6, 0.0]))
-    found = synthesized(replace(given, plant=plant), given.k_tau)
-    np.testing.assert_array_equal(found.k[1], given.k_tau[1])
-    assert found.cost == pytest.approx(162.0, abs=0.05)
-    assert found.spectral_radius < 1.0
+    case = spec("paper")
+    plant = replace(case.plant, w=np.diag([0.6, 0.0]))
+    result = synthesized(replace(case, plant=plant), case.k_tau)
+    np.testing.assert_array_equal(result.k[1], case.k_tau[1])
+    assert result.cost == pytest.approx(162.0, abs=0.05)
+    assert result.spectral_radius < 1.0
 
 
 @pytest.mark.slow
-def test_what_the_estimate_does_not_know_takes_room_too() -> None:
-    given = spec("paper", q_u=500.0 * np.eye(2), target_m=(0.0, 5.0, 0.0))
-    kappa_x, kappa_u = terminal_factors(given)
-    sets = (given.state_set, given.input_set, given.plant.equilibrium(given.target_m))
-    parts = (given.plant, given.tau, given.q_x, given.q_u, *sets, kappa_x, kappa_u)
+def test_the_estimate_error_takes_room_too() -> None:
+    case = spec("paper", q_u=500.0 * np.eye(2), target_m=(0.0, 5.0, 0.0))
+    kappa_x, kappa_u = terminal_factors(case)
+    sets = (case.state_set, case.input_set, case.plant.equilibrium(case.target_m))
+    parts = (case.plant, case.tau, case.q_x, case.q_u, *sets, kappa_x, kappa_u)
     with pytest.raises(DesignError, match=r"Assumption 4\.3"):
         synthesize(*parts, estimate_cov=np.diag([0.0, 0.0, 9.0, 0.01]))
-    found = synthesize(*parts, estimate_cov=np.diag([0.0, 0.0, 1.0, 0.01]))
-    design = make_design(replace(given, k_tau=found.k, estimate_cov=np.diag([0.0, 0.0, 1.0, 0.01])))
+    result = synthesize(*parts, estimate_cov=np.diag([0.0, 0.0, 1.0, 0.01]))
+    design = make_design(replace(case, k_tau=result.k, estimate_cov=np.diag([0.0, 0.0, 1.0, 0.01])))
     (check,) = (check for check in design.assumptions if check.item == "4.3")
-    assert check.value / check.limit == pytest.approx(MOST_FILLED, abs=1e-6)
+    assert check.value / check.limit == pytest.approx(MAX_FILLED, abs=1e-6)
 
 
 @pytest.mark.parametrize("growth", [1.2, 1.24])
 def test_an_unstable_plant_is_stabilised_almost_up_to_the_longest_delay_that_allows_it(growth: float) -> None:
     """x(k+1) = g x(k) + K x(k-τ) can be made stable for g < (τ+1)/τ only: 1.25 here."""
-    found = least(axis([[growth]], [[1.0]], [[1.0]]), 4, np.eye(1), np.eye(1))
-    assert found.spectral_radius < 1.0
+    result = minimum(axis([[growth]], [[1.0]], [[1.0]]), 4, np.eye(1), np.eye(1))
+    assert result.spectral_radius < 1.0
 
 
 @pytest.mark.parametrize("growth", [1.26, 2.0])
 def test_too_long_a_delay_for_an_unstable_plant_is_refused(growth: float) -> None:
     with pytest.raises(DesignError, match=rf"smpc\.tau: no gain on a state tau = 4 .* alone {growth}") as refused:
-        least(axis([[growth]], [[1.0]], [[1.0]]), 4, np.eye(1), np.eye(1))
+        minimum(axis([[growth]], [[1.0]], [[1.0]]), 4, np.eye(1), np.eye(1))
     assert refused.value.key == "smpc.tau"
 
 
 def test_limits_that_no_gain_fits_are_refused_with_figures() -> None:
     plant = one_axis(paper_plant())
     with pytest.raises(DesignError, match=r"takes 4\.\d+ of the room to a state limit \(Assumption 4\.3\)") as refused:
-        least(plant, 4, np.diag([10.0, 0.1]), np.array([[0.1]]), x=[1.0, INF])
+        minimum(plant, 4, np.diag([10.0, 0.1]), np.array([[0.1]]), x=[1.0, INF])
     assert refused.value.key == "smpc.k_tau"
 
 
@@ -314,12 +314,12 @@ def test_limits_that_no_gain_fits_are_refused_with_figures() -> None:
     ],
     ids=str,
 )
-def test_what_cannot_be_is_refused(changes: dict[str, Any], key: str) -> None:
-    given = spec("paper", **changes)
+def test_impossible_arguments_are_refused(changes: dict[str, Any], key: str) -> None:
+    case = spec("paper", **changes)
     with pytest.raises(DesignError) as refused:
         synthesize(
-            given.plant, given.tau, given.q_x, given.q_u, given.state_set, given.input_set,
-            given.plant.equilibrium(given.target_m), 3.0, 2.0,
+            case.plant, case.tau, case.q_x, case.q_u, case.state_set, case.input_set,
+            case.plant.equilibrium(case.target_m), 3.0, 2.0,
         )  # fmt: skip
     assert refused.value.key == key
 
@@ -327,31 +327,31 @@ def test_what_cannot_be_is_refused(changes: dict[str, Any], key: str) -> None:
 def test_a_state_that_no_input_reaches_is_refused() -> None:
     plant = axis([[0.9, 0.0], [0.0, 0.5]], [[1.0], [0.0]], [[1.0], [0.0]])
     with pytest.raises(DesignError, match=r"plant\.b: states \[1\]"):
-        least(plant, 1, np.eye(2), np.eye(1))
+        minimum(plant, 1, np.eye(2), np.eye(1))
 
 
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 @pytest.mark.parametrize("allocation", ["ellipsoid", "halfspace"])
 @pytest.mark.parametrize("rule", ["fixed", "greedy"])
 def test_factors_are_those_of_the_design(name: str, allocation: str, rule: str) -> None:
-    given = spec(name, allocation=allocation, rule=rule)
-    design = make_design(given)
-    assert terminal_factors(given) == (design.kappa_x_terminal, design.kappa_u_terminal)
+    case = spec(name, allocation=allocation, rule=rule)
+    design = make_design(case)
+    assert terminal_factors(case) == (design.kappa_x_terminal, design.kappa_u_terminal)
 
 
 def test_factors_of_a_search_cover_every_schedule_that_it_may_choose() -> None:
-    given = spec("paper", rule="search", search_states=np.zeros((1, 4)))
-    most = terminal_factors(given)
+    case = spec("paper", rule="search", search_states=np.zeros((1, 4)))
+    maximum = terminal_factors(case)
 
-    seen = []
+    observed = []
 
     def cost_of(design: Any, x: Array) -> float:
-        seen.append((design.kappa_x_terminal, design.kappa_u_terminal))
+        observed.append((design.kappa_x_terminal, design.kappa_u_terminal))
         return 1.0
 
-    make_design(given, cost_of)
-    assert len(seen) > 10
-    assert all(x <= most[0] and u <= most[1] for x, u in seen)
+    make_design(case, cost_of)
+    assert len(observed) > 10
+    assert all(x <= maximum[0] and u <= maximum[1] for x, u in observed)
 
 
 @pytest.mark.parametrize("rule", ["fixed", "greedy", "search"])

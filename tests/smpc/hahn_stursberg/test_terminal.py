@@ -41,10 +41,10 @@ def delayed_response(plant: Plant, tau: int, k: Array, steps: int) -> list[Array
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_covariance_is_the_sum_of_impulse_responses(name: str) -> None:
     plant = paper_plant() if name == "paper" else room_plant()
-    given = spec(name)
-    terminal = make_terminal(plant, given.tau, given.k_tau, given.q_x, given.q_u)
-    n_x, tau = plant.n_x, given.tau
-    response = delayed_response(plant, tau, given.k_tau, 1500)
+    case = spec(name)
+    terminal = make_terminal(plant, case.tau, case.k_tau, case.q_x, case.q_u)
+    n_x, tau = plant.n_x, case.tau
+    response = delayed_response(plant, tau, case.k_tau, 1500)
     for i in range(tau + 1):
         for j in range(i, tau + 1):
             # the j-th of ξ is j - i steps later, so it has had j - i more responses
@@ -58,9 +58,9 @@ def test_covariance_is_the_sum_of_impulse_responses(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_covariance_of_z_is_that_of_the_states_it_is_made_from(name: str) -> None:
-    given = spec(name)
-    terminal = make_terminal(given.plant, given.tau, given.k_tau, given.q_x, given.q_u)
-    n_x, tau, k = given.plant.n_x, given.tau, given.k_tau
+    case = spec(name)
+    terminal = make_terminal(case.plant, case.tau, case.k_tau, case.q_x, case.q_u)
+    n_x, tau, k = case.plant.n_x, case.tau, case.k_tau
     # z = (x_N, K x_{N-τ} … K x_{N-1}): the same numbers from Σ_ξ, read as (x_{N-τ} … x_N).
     pick = np.zeros((n_x + tau * len(k), (tau + 1) * n_x))
     pick[:n_x, tau * n_x :] = np.eye(n_x)
@@ -85,13 +85,13 @@ def test_weight_is_the_cost_of_the_free_response() -> None:
 
 
 def test_printed_gain_gives_the_known_figures() -> None:
-    given = spec("paper")
-    terminal = make_terminal(given.plant, 4, given.k_tau, given.q_x, given.q_u)
+    case = spec("paper")
+    terminal = make_terminal(case.plant, 4, case.k_tau, case.q_x, case.q_u)
     assert terminal.spectral_radius == pytest.approx(0.9714, abs=5e-5)
     deviations = np.sqrt(np.diag(terminal.sigma_x))
     np.testing.assert_allclose(deviations, [5.079, 1.667, 5.079, 1.667], atol=5e-4)
     np.testing.assert_allclose(deviations[:2] * np.sqrt(chi2.ppf(0.95, 4)), [15.64, 5.13], atol=6e-3)
-    inputs = np.sqrt(np.diag(given.k_tau @ terminal.sigma_x @ given.k_tau.T)) * np.sqrt(chi2.ppf(0.9, 2))
+    inputs = np.sqrt(np.diag(case.k_tau @ terminal.sigma_x @ case.k_tau.T)) * np.sqrt(chi2.ppf(0.9, 2))
     np.testing.assert_allclose(inputs, [4.25, 4.25], atol=6e-3)
     # Σ_ξ has full rank (τ+1) n_x, not n_x as the paper says
     assert np.linalg.matrix_rank(terminal.sigma_xi) == 20
@@ -112,20 +112,20 @@ def test_stationary_cost_of_two_gains() -> None:
 
 
 def test_the_room_s_gain_is_a_local_minimum_of_the_stationary_cost() -> None:
-    given = spec("room-hahn-stursberg")
+    case = spec("room-hahn-stursberg")
 
     def cost(k: Array) -> float:
-        return stationary_cost(make_terminal(given.plant, given.tau, k, given.q_x, given.q_u))
+        return stationary_cost(make_terminal(case.plant, case.tau, k, case.q_x, case.q_u))
 
-    least = cost(given.k_tau)
-    entries = np.argwhere(given.k_tau != 0.0)
+    minimum = cost(case.k_tau)
+    entries = np.argwhere(case.k_tau != 0.0)
     assert len(entries) == 9
     for row, column in entries:
         for share in (0.99, 1.01):
-            moved = given.k_tau.copy()
-            moved[row, column] *= share
+            shifted = case.k_tau.copy()
+            shifted[row, column] *= share
             # 1 % of an entry costs some 1e-5 to 1e-4: its printed digits are within that of the minimum.
-            assert cost(moved) > least
+            assert cost(shifted) > minimum
 
 
 def test_stationary_cost_is_that_of_a_long_simulation() -> None:

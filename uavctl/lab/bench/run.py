@@ -40,7 +40,7 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
 from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutSolver
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
-from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
+from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
 from uavctl.smpc.sets import Polytope
 
 _N_COVARIANCES = 7  # in turns: the covariance of a filter changes at each decision
@@ -239,7 +239,9 @@ def run_bench(
         cases, sizes.runs, begin_phase("all methods in turns", decisions)
     )
     printed_points = points[: sizes.printed]
-    joint_case = TimedCase(PrintedSolver(design, joint=True, regularization=SOLVERS_OWN), printed_points, target)
+    joint_case = TimedCase(
+        PrintedSolver(design, joint=True, regularization=CLARABEL_REGULARIZATION), printed_points, target
+    )
     (joint,) = time_cases([joint_case], 1, begin_phase("printed, jointly", len(printed_points)))
 
     components = len(decompose(design))
@@ -420,7 +422,7 @@ def draw_questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator
         solver: Solver of the problems; all its axes have limits of position and input.
     """
     problem, rng = solver.problem, np.random.default_rng(seed)
-    plant, noise = problem.plant, solver.seen.e @ solver.seen.w @ solver.seen.e.T
+    plant, noise = problem.plant, solver.filter_plant.e @ solver.filter_plant.w @ solver.filter_plant.e.T
     low, high = problem.state_set.bounds
     is_limited = np.isfinite(low) & np.isfinite(high)
     sent_low, sent_high = problem.input_set.bounds

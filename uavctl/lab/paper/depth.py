@@ -27,7 +27,7 @@ from uavctl.lab.bench.timing import TimedCase, compute_median, time_cases
 from uavctl.lab.paper.claims import PRESET, PRINTED, Complexity, Depth, TriedDesign
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.nominal import lqr
@@ -220,7 +220,7 @@ def _measure_complexity(seed: int, on_step: ReportStep) -> list[Complexity]:
         if isinstance(design, str):
             entries.append((tau, horizon, design, 0))
             continue
-        entries.append((tau, horizon, "", horizon_of(design, decompose(design)[0]).n_theta))
+        entries.append((tau, horizon, "", make_horizon(design, decompose(design)[0]).n_theta))
         cases += [TimedCase(solver, points, design.target) for solver in (ConicSolver(design), PrintedSolver(design))]
     on_step("complexity, all in turns")
     times = iter([compute_median(result.us) for result in time_cases(cases, _RUNS)])

@@ -1,4 +1,21 @@
-"""The back-off of each stage: risk over ages and rows (its quantile), and the deviation that it is a quantile of."""
+"""Back-offs: spread of the risk over ages and rows, standard deviations of the rows, and distances at rest.
+
+1. `spread_risk` and `spread_risk_equally` spread the allowed risk 1 - δ_x over the ages t: budgets ε̄_t with
+   Σ_t π_t ε̄_t = 1 - δ_x - P(a > H).
+2. `shift_risk` spreads the budget of an age over the rows of a plan (iterative risk allocation): rows that do not bind
+   give risk to rows that bind. Row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti.
+3. `Deviations` are the σ_ti of a plan in open loop:
+
+       σ² = c'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c,   t = 1 … H
+
+4. `compute_rest_backoffs`: plans keep their back-offs as rows of the program. The reference decides how often a new
+   position leaves a plan that cannot keep them. It keeps the larger of two distances from a limit:
+   - with the first, a plan at rest at all ages is outside no more often than allowed;
+   - with the second, at most a share of new plans needs slack, by a model of their first state. After t steps without
+     a position (probability q_t) the mean is at the reference, or at the back-off β_t if that is further away, and the
+     new position moves it by e ~ N(0, S_t), S_t = Σ_t - Σ_0. With the reach g_s of the inputs, stage s of the new plan
+     leaves its back-off if c'A^s e > max(d, β_t) - β_s + g_s.
+"""
 
 from __future__ import annotations
 
@@ -19,371 +36,370 @@ from uavctl.smpc.nominal import ControlProblem, Part, propagate_covariance
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import find_pairs
 
-# The allowed risk, spread over the ages of the information that a plan may be based on.
-
-
-PRICE = 1.0  # h of π_t^h, what an age's back-off costs: its share of time. More keeps plans back for ages seldom met
-LARGEST_RISK = 0.5  # of a row: a mean outside of its limit is no plan
-LEAST_RISK = 1e-9  # of an age's budget: what rounding may leave
-SELDOM = 0.05  # of the allowed risk: what the oldest ages may use up that keep nothing back in transit
+PRICE = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
+MAX_RISK = 0.5  # largest risk of a row: with more, the mean would be outside of its limit
+MIN_RISK = 1e-9  # least rest of the allowed risk, as a share of it: a smaller rest is rounding
+RARE_SHARE = 0.05  # share of the allowed risk that the oldest ages, without back-offs, may use in transit
 
 
 @dataclass(frozen=True, eq=False)
 class AgeRisk:
-    """Spread of a time's risk over the ages of the information that its plan may be based on."""
+    """Spread of the risk over the ages of the information of a plan."""
 
     weights: Array  # π_t (H,), of information t = 1 … H steps old
-    beyond: float  # probability that it is older than H: no plan is left then, and all of it counts as outside
-    # ε̄_t (H,), growing with t, with Σ_t π_t ε̄_t = 1 - δ_x - `beyond`, unless LARGEST_RISK of each row bounds them
+    older_probability: float  # P(a > H): there is no plan then, and all of it counts as outside
+    # ε̄_t (H,), growing with t, with Σ_t π_t ε̄_t = 1 - δ_x - `older_probability`, if MAX_RISK of each row allows it
     budgets: Array
 
     @property
     def shares(self) -> Array:
-        """Risk that plans spread over their rows (H,); infinite where ε̄_t is 1, for then nothing is asked."""
+        """Risk that plans spread over their rows (H,); infinite where ε̄_t is 1, because the rows are free then."""
         return np.where(self.budgets >= 1.0, np.inf, self.budgets)
 
 
-def age_risk(link: AgeModel, deviations: Array, allowed: float, price: float = PRICE, corner: int = 1) -> AgeRisk:
-    """Spread the allowed risk so that Σ_t π_t^h β_t is least where n rows alike bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.
+def spread_risk(link: AgeModel, deviations: Array, allowed: float, price: float = PRICE, corner: int = 1) -> AgeRisk:
+    """Spread the allowed risk so that Σ_t π_t^h β_t is least where n equal rows bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.
 
-    Were it least for one row, ages that are all but never met would end at LARGEST_RISK with no back-off, and where two
-    rows share that, their back-offs at those ages would be the largest of all: corners would be kept far away from.
+    With n = 1, rare ages would get MAX_RISK and no back-off. Where two rows share MAX_RISK, their back-offs at these
+    ages would be the largest of all, and plans would stay far from corners.
 
     Args:
         deviations: σ_t (H,) of the rows.
         allowed: 1 - δ_x.
+        price: h.
+        corner: n, the number of rows that may bind together.
 
     Raises:
-        DesignError: Information is older than the horizon more often than is allowed.
+        DesignError: Information is older than the horizon more often than allowed.
     """
     steps = len(deviations)
-    weights, beyond, left = _ages(link, steps, allowed)
-    most = min(1.0, corner * LARGEST_RISK)
+    weights, older_probability, remaining = _weigh_ages(link, steps, allowed)
+    max_budget = min(1.0, corner * MAX_RISK)
     if not deviations.all():
-        return AgeRisk(weights, beyond, np.full(steps, min(left / weights.sum(), most)))
+        return AgeRisk(weights, older_probability, np.full(steps, min(remaining / weights.sum(), max_budget)))
     # Stationary: π_t φ(κ_t) / σ_t = λ π_t^h, so κ_t² = 2 log(π_t^(1-h) / (λ σ_t)) where that is positive.
     scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - price) - np.log(deviations)
 
     def budgets(level: float) -> Array:
-        # No younger age has more: a link that is better than its model uses up no more risk.
-        each = np.minimum(corner * ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))), most)
-        return np.ascontiguousarray(np.minimum.accumulate(each[::-1])[::-1])
+        # ε̄_t = n Φ(-κ_t), not larger for a younger age: a link better than its model uses no more risk.
+        values = np.minimum(corner * ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))), max_budget)
+        return np.ascontiguousarray(np.minimum.accumulate(values[::-1])[::-1])
 
     def excess(level: float) -> float:
-        return float(weights @ budgets(level)) - left
+        return float(weights @ budgets(level)) - remaining
 
-    from scipy.optimize import brentq  # loaded where a design is made, for it takes long
+    from scipy.optimize import brentq  # slow to import, needed for a design only
 
     low, high = -float(scale.max()), -float(scale[weights > 0.0].min()) + 1000.0
-    return AgeRisk(weights, beyond, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))
+    return AgeRisk(weights, older_probability, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))
 
 
-def equal_risk(link: AgeModel, steps: int, allowed: float, corner: int = 1) -> AgeRisk:
-    """Spread the allowed risk equally over the ages, but for the oldest that hardly come: those keep nothing back.
+def spread_risk_equally(link: AgeModel, steps: int, allowed: float, corner: int = 1) -> AgeRisk:
+    """Spread the allowed risk equally over the ages, except the oldest and rarest: those have no back-offs.
 
-    Where a target leaves room no plan rests near a limit, and limits are met only on the way, by plans that are young:
-    what an age costs there is not its share of time. Ages that keep nothing back use up SELDOM of the risk together.
+    Where a target leaves room, no plan rests near a limit. Limits matter in transit only, for plans of young ages, so
+    the weight of an age is not its share of time. Ages without back-offs use RARE_SHARE of the risk together.
 
     Args:
         allowed: 1 - δ_x.
 
     Raises:
-        DesignError: Information is older than the horizon more often than is allowed.
+        DesignError: Information is older than the horizon more often than allowed.
     """
-    weights, beyond, left = _ages(link, steps, allowed)
+    # ε̄_t = 1 for rare ages, else (1 - δ_x - P(a > H) - Σ_rare π_t) / Σ_other π_t
+    weights, older_probability, remaining = _weigh_ages(link, steps, allowed)
     older = np.cumsum(weights[::-1])[::-1]
-    seldom = older <= SELDOM * left
-    most = min(1.0, corner * LARGEST_RISK)
-    equal = min(most, (left - float(weights[seldom].sum())) / float(weights[~seldom].sum()))
-    return AgeRisk(weights, beyond, np.where(seldom, 1.0, equal))
+    rare = older <= RARE_SHARE * remaining
+    max_budget = min(1.0, corner * MAX_RISK)
+    equal = min(max_budget, (remaining - float(weights[rare].sum())) / float(weights[~rare].sum()))
+    return AgeRisk(weights, older_probability, np.where(rare, 1.0, equal))
 
 
-def _ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, float]:
-    """π_t (H,), the probability of more than H, and what is left of the allowed risk."""
+def _weigh_ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, float]:
+    """Return π_t (H,), P(a > H), and the rest of the allowed risk."""
+    # π_t = P(a >= t-1) - P(a >= t), as shares of time in the long run
     older = np.array([link.outage(age) for age in range(steps + 1)])
-    weights, beyond = older[:-1] - older[1:], float(older[-1])
-    left = allowed - beyond
-    if left <= LEAST_RISK * allowed:
+    weights, older_probability = older[:-1] - older[1:], float(older[-1])
+    remaining = allowed - older_probability
+    if remaining <= MIN_RISK * allowed:
         raise DesignError(
             "smpc.horizon",
-            f"positions are {steps} steps old or more in {beyond:.3g} of all steps, and no more than {allowed:.3g} "
-            "may be outside of the limits",
+            f"positions are {steps} steps old or more in {older_probability:.3g} of all steps, and no more than "
+            f"{allowed:.3g} may be outside of the limits",
             "take a longer smpc.horizon or a lower smpc.delta_x",
         )
-    return weights, beyond, left
-
-
-# Spread of the risk of an age over the rows of a plan: iterative risk allocation.
+    return weights, older_probability, remaining
 
 
 Flags = NDArray[np.bool_]
 
-_KEEPS = 0.5  # of the room between a row that does not bind and its back-off: what it keeps
-_AWAY = -float(ndtri(1e-6))  # deviations beyond which a row that does not bind keeps no more
-DISTANT = 0.1  # of a budget: what rows share, before there is a plan, that the regulator's is not near
-_BINDS = 1e-9  # of a row's standard deviation: nearer than this to its back-off, it binds
+_KEPT_SHARE = 0.5  # share of the room beyond its back-off that a row which does not bind keeps
+_MAX_DEVIATIONS = -float(ndtri(1e-6))  # most deviations that a row which does not bind keeps
+DISTANT_SHARE = 0.1  # share of a budget for rows that the regulator's plan is not near, before there is a plan
+_BINDING_TOLERANCE = 1e-9  # distance from its back-off at which a row binds, in standard deviations
 
 
 def quantile(risk: Array) -> Array:
-    """Standard deviations that leave a risk on one side; none where it is above LARGEST_RISK."""
-    return np.asarray(-ndtri(np.minimum(risk, LARGEST_RISK)))
+    """Return κ = Φ⁻¹(1 - ε) of risks ε; 0 above MAX_RISK."""
+    return np.asarray(-ndtri(np.minimum(risk, MAX_RISK)))
 
 
-def spent(room: Array, sigma: Array) -> Array:
-    """Probability that a row is left whose mean keeps that room; all of the same shape."""
+def violation_risk(room: Array, sigma: Array) -> Array:
+    """Return the probability Φ(-room / σ) that a row is violated whose mean keeps `room`; all of the same shape."""
     if np.count_nonzero(sigma) == sigma.size:
         return np.asarray(ndtr(room / -sigma))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(sigma > 0.0, ndtr(-room / sigma), np.where(room < 0.0, 1.0, 0.0))
 
 
-def binding(backoff: Array, room: Array, sigma: Array) -> Flags:
-    """Return which rows are at their back-offs, or beyond."""
-    return np.asarray(room <= backoff + _BINDS * sigma)
+def find_binding(backoff: Array, room: Array, sigma: Array) -> Flags:
+    """Return which rows are at their back-offs or beyond."""
+    return np.asarray(room <= backoff + _BINDING_TOLERANCE * sigma)
 
 
-def shifted(
-    backoff: Array, room: Array, sigma: Array, budgets: Array, binds: Flags, away: Array | float = _AWAY
+def shift_risk(
+    backoff: Array,
+    room: Array,
+    sigma: Array,
+    budgets: Array,
+    binds: Flags,
+    max_deviations: Array | float = _MAX_DEVIATIONS,
 ) -> Array:
-    """Back-offs after risk has gone from the rows that do not bind to those that do, in stages where some do.
+    """Shift risk from rows that do not bind to rows that bind, in stages with binding rows; return the new back-offs.
 
-    What does not bind keeps half of its room, so the plan at hand keeps all of them.
+    A row that does not bind keeps half of its room, so the present plan keeps all new back-offs.
 
     Args:
-        backoff: Back-offs so far (S, m) of some stages.
-        room: Room that the plan at hand leaves (S, m).
+        backoff: Present back-offs (S, m) of some stages.
+        room: Room that the present plan leaves (S, m).
         sigma: Standard deviations (S, m).
         budgets: ε̄ of the stages (S,), growing; where it is infinite there are no back-offs.
         binds: Which rows bind (S, m).
-        away: Standard deviations (S, 1) beyond which a row that does not bind keeps no more.
+        max_deviations: Most standard deviations (S, 1) that a row which does not bind keeps.
     """
+    # Not binding: β <- min(β + (room - β)/2, max(β, κ_max σ));  binding: β <- Φ⁻¹(1 - (ε̄ - Σ ε_i) / n) σ
     kept = room - backoff
     np.maximum(kept, 0.0, out=kept)
-    kept *= _KEEPS
+    kept *= _KEPT_SHARE
     kept += backoff
-    np.minimum(kept, np.maximum(backoff, away * sigma), out=kept)
+    np.minimum(kept, np.maximum(backoff, max_deviations * sigma), out=kept)
     if budgets[-1] == math.inf:
         kept *= np.isfinite(budgets)[:, None]
-    risk = spent(kept, sigma)
+    risk = violation_risk(kept, sigma)
     np.putmask(risk, binds, 0.0)
-    count = binds.dot(_ones(binds.shape[1]))
-    left = budgets - np.add.reduce(risk, axis=1)
+    count = binds.dot(_make_ones(binds.shape[1]))
+    remaining = budgets - np.add.reduce(risk, axis=1)
     everywhere = np.count_nonzero(count) == count.size
-    share = quantile(left / (count if everywhere else np.maximum(count, 1.0)))
+    share = quantile(remaining / (count if everywhere else np.maximum(count, 1.0)))
     np.multiply(share[:, None], sigma, out=kept, where=binds)
     return kept if everywhere else np.where(count[:, None] > 0.0, kept, backoff)
 
 
 @cache
-def _ones(count: int) -> Array:
-    """A product with them is a quicker sum than that of flags."""
+def _make_ones(count: int) -> Array:
+    """Make a vector of ones: a product with it is faster than a sum of flags."""
     return np.ones(count)
-
-
-# Distances that plans with risk conditioned on the age keep from a limit that they rest at.
-#
-# A plan keeps its back-offs wherever its reference is: they are rows of the program. The reference decides how often
-# a new position leaves a plan that cannot keep them. So it keeps the larger of two distances from a limit. At the
-# first, a plan that rests there at all ages would be outside no more often than allowed. At the second, no more than
-# a share of the new plans need slack, by a model of what they begin from: after t steps without news (probability
-# q_t) the mean is at the reference, or at the back-off β_t where that is further, and news are e ~ N(0, S_t), S_t =
-# Σ_t - Σ_0. With the whole reach g_s of the inputs, stage s of the new plan has to leave its back-off if c'A^s e >
-# max(d, β_t) - β_s + g_s.
-
-
-# Standard deviations of state rows under a plan that is played out in open loop.
 
 
 Index = NDArray[np.intp]
 
 
 class Deviations:
-    """σ_ti of the state rows: σ² = c'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c in the stages t = 1 … H.
+    """Standard deviations σ_ti of the state rows under a plan in open loop.
 
-    Where a filter knows more states than the plant has, biases of its inputs (`with_bias`), A, E, W and P are those of
-    all of them. It is linear in the entries of P that a part has to do with. All parts are one product; where they are
-    of different sizes the smaller ones are filled up with zeros. Both sides of a direction share one deviation.
+    Where the filter has more states than the plant, biases of its inputs (`add_bias`), A, E, W and P include them. σ²
+    is linear in the entries of P of a part. One product computes all parts; smaller parts are padded with zeros. Both
+    sides of a direction share one deviation.
 
     Args:
-        parts: Independent parts, whose rows stand side by side.
-        seen: The plant as the filter sees it.
+        parts: Independent parts; their rows stand side by side.
+        filter_plant: Plant of the filter.
     """
 
-    def __init__(self, problem: ControlProblem, parts: Sequence[Part], seen: Plant) -> None:
-        steps, noise = problem.horizon, seen.e @ seen.w @ seen.e.T
-        found = [_of_part(problem, part, seen, noise) for part in parts]
-        most, entries = (max(size) for size in zip(*((one[0].shape[1:]) for one in found), strict=True))
-        self._of_cov = np.zeros((len(parts), steps * most, entries))
-        self._alone = np.zeros((len(parts), steps * most))
+    def __init__(self, problem: ControlProblem, parts: Sequence[Part], filter_plant: Plant) -> None:
+        steps, noise = problem.horizon, filter_plant.e @ filter_plant.w @ filter_plant.e.T
+        maps = [_make_part_maps(problem, part, filter_plant, noise) for part in parts]
+        max_rows, entries = (max(size) for size in zip(*((part_map[0].shape[1:]) for part_map in maps), strict=True))
+        self._cov_maps = np.zeros((len(parts), steps * max_rows, entries))
+        self._constant = np.zeros((len(parts), steps * max_rows))
         self._entries = np.zeros((len(parts), entries, 1), dtype=np.intp)
-        self._squares = seen.n_x**2
+        self._squares = filter_plant.n_x**2
         places = []
-        for i, (part, (of_cov, alone, own)) in enumerate(zip(parts, found, strict=True)):
-            count, squares = of_cov.shape[1:]
-            stage = most * np.arange(steps)[:, None]
+        for i, (part, (cov_maps, constant, directions)) in enumerate(zip(parts, maps, strict=True)):
+            count, squares = cov_maps.shape[1:]
+            stage = max_rows * np.arange(steps)[:, None]
             at = (stage + np.arange(count)).ravel()
-            self._of_cov[i, at, :squares], self._alone[i, at] = of_cov.reshape(-1, squares), alone.ravel()
-            states = _states(problem, part, seen)
-            self._entries[i, :squares, 0] = (states[:, None] * seen.n_x + states).ravel()
-            places.append(i * steps * most + stage + own)
+            self._cov_maps[i, at, :squares], self._constant[i, at] = cov_maps.reshape(-1, squares), constant.ravel()
+            states = _find_filter_states(problem, part, filter_plant)
+            self._entries[i, :squares, 0] = (states[:, None] * filter_plant.n_x + states).ravel()
+            places.append(i * steps * max_rows + stage + directions)
         self._places = np.hstack(places)
 
-    def of(self, cov: Array | None) -> Array:
-        """Deviations (H, m) by the covariance of the estimate's error, biases included (n, n); None: it is exact.
+    def compute(self, cov: Array | None) -> Array:
+        """Compute σ (H, m) from the covariance of the estimate's error, biases included (n, n); None: it is exact.
 
         Raises:
             ValueError: It is of another size.
         """
-        variance = self._alone
+        variance = self._constant
         if cov is not None:
             if cov.size != self._squares:
                 raise ValueError(f"a covariance of shape {cov.shape}, wanted {self._squares} entries")
-            variance = variance + (self._of_cov @ cov.ravel().take(self._entries))[:, :, 0]
+            variance = variance + (self._cov_maps @ cov.ravel().take(self._entries))[:, :, 0]
             np.maximum(variance, 0.0, out=variance)
         return np.sqrt(variance).ravel().take(self._places)
 
 
-def _states(problem: ControlProblem, part: Part, seen: Plant) -> Index:
-    """The states of a part among those of a filter: the plant's, and the biases of its inputs."""
-    biases = part.inputs if seen.n_x > problem.plant.n_x else part.inputs[:0]
+def _find_filter_states(problem: ControlProblem, part: Part, filter_plant: Plant) -> Index:
+    """Return the indices of a part's states in the filter: those of the plant, and the biases of its inputs."""
+    biases = part.inputs if filter_plant.n_x > problem.plant.n_x else part.inputs[:0]
     return np.concatenate([part.states, problem.plant.n_x + biases])
 
 
-def _of_part(problem: ControlProblem, part: Part, seen: Plant, noise: Array) -> tuple[Array, Array, Index]:
-    """Variance of each direction by each entry of P (H, d, n²) and without P (H, d), and each row's direction (m,)."""
-    states = _states(problem, part, seen)
+def _make_part_maps(
+    problem: ControlProblem, part: Part, filter_plant: Plant, noise: Array
+) -> tuple[Array, Array, Index]:
+    """Return c'A^t ⊗ c'A^t (H, d, n²), the variance without P (H, d), and each row's direction (m,)."""
+    states = _find_filter_states(problem, part, filter_plant)
     index = np.ix_(states, states)
-    a, noise = seen.a[index], noise[index]
+    a, noise = filter_plant.a[index], noise[index]
     pairs = find_pairs(problem.state_set.c[np.ix_(part.rows_x, part.states)])
     c = np.array([pair.c for pair in pairs]).reshape(-1, part.states.size)
     c = np.pad(c, ((0, 0), (0, states.size - part.states.size)))
-    own = np.zeros(part.rows_x.size, dtype=np.intp)
+    directions = np.zeros(part.rows_x.size, dtype=np.intp)
     for i, pair in enumerate(pairs):
-        own[[row for _, row in pair.sides]] = i
+        directions[[row for _, row in pair.sides]] = i
+    # Σ_{t+1} = A Σ_t A' + E W E',  Σ_0 = 0
     power, spread = np.eye(len(a)), np.zeros_like(noise)
-    of_cov, alone = [], []
+    cov_maps, constants = [], []
     for _ in range(problem.horizon):
         power, spread = a @ power, a @ spread @ a.T + noise
         phi = c @ power
-        of_cov.append((phi[:, :, None] * phi[:, None, :]).reshape(len(c), states.size**2))
-        alone.append(np.einsum("mi,ij,mj->m", c, spread, c))
-    return np.array(of_cov), np.array(alone), own
+        cov_maps.append((phi[:, :, None] * phi[:, None, :]).reshape(len(c), states.size**2))
+        constants.append(np.einsum("mi,ij,mj->m", c, spread, c))
+    return np.array(cov_maps), np.array(constants), directions
 
 
-SLACK = 0.7  # of 1 - δ_x: share of new plans that may need slack beside a limit, by the model
+SLACK_SHARE = 0.7  # share of new plans beside a limit that may need slack, as a share of 1 - δ_x
 
 
-def rest_backoffs(
+def compute_rest_backoffs(
     problem: ControlProblem,
     risk: AgeRisk,
     allowed: float,
     slew: SlewRows,
     c: Array,
     cov: Array | None,
-    most: int,
-    seen: Plant | None = None,
+    max_shares: int,
+    filter_plant: Plant | None = None,
 ) -> Array:
-    """Return the distances (most, m) that plans at rest keep from rows `c` (m, n_x), where 1 … `most` share the risk.
+    """Return the distances (max_shares, m) of plans at rest from rows `c` (m, n_x), for 1 … `max_shares` sharing rows.
 
     Args:
         risk: How the risk is spread over the ages.
         allowed: 1 - δ_x.
-        slew: How far setpoints may go in a step.
+        slew: Largest change of setpoints in a step.
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
-        seen: The plant as the filter sees it, of n states, the plant's before biases of its inputs; None: as it is. A
-            bias that is found to be another one is no news to a plan, which counts all that acts.
+        filter_plant: Plant of the filter, of n states, the plant's before biases of its inputs; None: `problem.plant`.
+            A new estimate of a bias changes no plan, because inputs include the bias.
     """
-    asked = _asked(problem, risk, slew, c, cov, problem.plant if seen is None else seen)
-    rooms = np.zeros((most, len(c)))
-    for share in range(1, most + 1):
+    rows = _make_resting_rows(problem, risk, slew, c, cov, problem.plant if filter_plant is None else filter_plant)
+    distances = np.zeros((max_shares, len(c)))
+    for share in range(1, max_shares + 1):
         for row in range(len(c)):
-            rooms[share - 1, row] = asked.distance(row, share, allowed)
-    return rooms
+            distances[share - 1, row] = rows.find_distance(row, share, allowed)
+    return distances
 
 
 @dataclass(frozen=True, eq=False)
 class _RestingRows:
-    """Data of the rows for plans at rest, with stages s = 1 … H of a new plan and t = 1 … L of the one before."""
+    """Rows of plans at rest, with stages s = 1 … H of a new plan and t = 1 … L of the previous one."""
 
     risk: AgeRisk  # spread of the risk over the ages
-    late: int  # age of most positions when they come [steps]
+    age: int  # age of most positions when they arrive [steps]
     gaps: Array  # q_t (L,)
     sigma: Array  # deviations of the rows (H, m) in the stages of a plan
-    reach: Array  # how far inputs bring them away from the limit (H, m)
-    news: Array  # deviations of the rows (L, H, m) in the stages of a new plan that news make, before its inputs
+    reach: Array  # g_s, distance from the limit that inputs can gain (H, m)
+    jump: Array  # deviations of c'A^s e (L, H, m), the effect of a new position on the rows
 
-    def distance(self, row: int, share: int, allowed: float) -> float:
+    def find_distance(self, row: int, share: int, allowed: float) -> float:
         """Return the distance to keep from a row that shares the risk with `share` - 1 others."""
-        weights, sigma = self.risk.weights[self.late :], self.sigma[: self.gaps.size, row]
-        ages = np.minimum(self.late + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
+        weights, sigma = self.risk.weights[self.age :], self.sigma[: self.gaps.size, row]
+        ages = np.minimum(self.age + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
         backoff = quantile(self.risk.shares[ages] / share) * self.sigma[:, row]
-        before, off = backoff[: self.gaps.size, None], self.news[:, :, row]
+        before, jumps = backoff[: self.gaps.size, None], self.jump[:, :, row]
 
-        def resting(d: float) -> float:
-            return float(weights @ spent(np.full_like(sigma, d), sigma)) - (allowed - self.risk.beyond) / share
+        def rest_excess(d: float) -> float:
+            # Σ_t π_t Φ(-d / σ_t) - (1 - δ_x - P(a > H)) / n
+            return (
+                float(weights @ violation_risk(np.full_like(sigma, d), sigma))
+                - (allowed - self.risk.older_probability) / share
+            )
 
-        def slack(d: float) -> float:
+        def slack_excess(d: float) -> float:
+            # Σ_t q_t max_s Φ(-(max(d, β_t) - β_s + g_s) / σ_ts) - 0.7 (1 - δ_x) / n
             room = np.maximum(d, before) - backoff + self.reach[:, row]
-            return float(self.gaps @ spent(room, off).max(axis=1)) - SLACK * allowed / share
+            return float(self.gaps @ violation_risk(room, jumps).max(axis=1)) - SLACK_SHARE * allowed / share
 
-        from scipy.optimize import brentq  # loaded where a design is made, for it takes long
+        from scipy.optimize import brentq  # slow to import, needed for a design only
 
-        found = 0.0
-        for excess in (resting, slack):
-            if excess(found) > 0.0:
-                far = found + float(max(self.sigma[:, row].max(), backoff.max(), off.max()))
-                while excess(far) > 0.0:
-                    far *= 2.0
-                found = float(brentq(excess, found, far))
-        return found
+        distance = 0.0
+        for excess in (rest_excess, slack_excess):
+            if excess(distance) > 0.0:
+                upper = distance + float(max(self.sigma[:, row].max(), backoff.max(), jumps.max()))
+                while excess(upper) > 0.0:
+                    upper *= 2.0
+                distance = float(brentq(excess, distance, upper))
+        return distance
 
 
-def _asked(
-    problem: ControlProblem, risk: AgeRisk, slew: SlewRows, c: Array, cov: Array | None, filtered: Plant
+def _make_resting_rows(
+    problem: ControlProblem, risk: AgeRisk, slew: SlewRows, c: Array, cov: Array | None, filter_plant: Plant
 ) -> _RestingRows:
     plant, steps = problem.plant, problem.horizon
-    late = int(risk.weights.argmax())
-    spread = propagate_covariance(filtered, late + steps, cov)[late:, : plant.n_x, : plant.n_x]
-    # Share of plans that are still flown at each age of their information, from the shares of time π.
-    flown = np.minimum.accumulate(risk.weights[late:] / risk.weights[late])
-    gaps = flown - np.append(flown[1:], 0.0)
-    news = spread[1 : gaps.size + 1] - spread[0]
-    seen = c @ _powers(plant.a, steps)  # (H+1, m, n_x)
-    variance = np.einsum("smi,tij,smj->tsm", seen[1:], news, seen[1:])
+    age = int(risk.weights.argmax())
+    spread = propagate_covariance(filter_plant, age + steps, cov)[age:, : plant.n_x, : plant.n_x]
+    # Share of plans that are still flown at each age, and q_t of those that end there
+    flown_share = np.minimum.accumulate(risk.weights[age:] / risk.weights[age])
+    gaps = flown_share - np.append(flown_share[1:], 0.0)
+    # S_t = Σ_t - Σ_0,  var(c'A^s e) = c'A^s S_t A^s'c
+    jump_cov = spread[1 : gaps.size + 1] - spread[0]
+    c_powers = c @ _compute_powers(plant.a, steps)  # (H+1, m, n_x)
+    variance = np.einsum("smi,tij,smj->tsm", c_powers[1:], jump_cov, c_powers[1:])
     deviations = np.sqrt(np.maximum(np.einsum("mi,tij,mj->tm", c, spread[1:], c), 0.0))
     return _RestingRows(
-        risk, late, gaps, deviations, _reach(problem, slew, seen[:-1]), np.sqrt(np.maximum(variance, 0.0))
+        risk, age, gaps, deviations, _compute_reach(problem, slew, c_powers[:-1]), np.sqrt(np.maximum(variance, 0.0))
     )
 
 
-def _powers(matrix: Array, most: int) -> Array:
-    """The powers 0 … `most` of a matrix."""
-    found = [np.eye(len(matrix))]
-    for _ in range(most):
-        found.append(matrix @ found[-1])
-    return np.array(found)
+def _compute_powers(matrix: Array, max_power: int) -> Array:
+    """Return the powers 0 … `max_power` of a matrix."""
+    powers = [np.eye(len(matrix))]
+    for _ in range(max_power):
+        powers.append(matrix @ powers[-1])
+    return np.array(powers)
 
 
-def _reach(problem: ControlProblem, slew: SlewRows, seen: Array) -> Array:
-    """Return how far inputs bring the rows away from their limits in 1 … H steps (H, m), from an input of zero.
+def _compute_reach(problem: ControlProblem, slew: SlewRows, c_powers: Array) -> Array:
+    """Return the distance from the limits that inputs can gain in 1 … H steps (H, m), from an input of zero.
 
     Args:
-        slew: How far setpoints may go in a step.
-        seen: c'A^s (H, m, n_x).
+        slew: Largest change of setpoints in a step.
+        c_powers: c'A^s (H, m, n_x).
     """
-    of_u = seen @ problem.plant.b
-    low, high = problem.input_set.bounds
-    zero = np.clip(0.0, low, high)
-    a_step = np.full(zero.size, np.inf)
+    input_effects = c_powers @ problem.plant.b
+    lower, upper = problem.input_set.bounds
+    zero = np.clip(0.0, lower, upper)
+    step_change = np.full(zero.size, np.inf)
     for row in np.abs(slew.d):
-        (own,) = np.nonzero(row)
-        a_step[own] = np.minimum(a_step[own], slew.side / row[own])
-    so_far = np.arange(1, len(seen) + 1)[:, None] * a_step
-    down, up = (np.minimum(so_far, side)[:, None] for side in (zero - low, high - zero))
-    found: Array = np.empty(seen.shape[:2])
-    for stage in range(len(seen)):
-        each = of_u[stage::-1]  # of the inputs 0 … `stage`
-        with np.errstate(invalid="ignore"):  # an input without limits that a row does not feel
-            moved = np.where(each > 0.0, each * down[: stage + 1], -each * up[: stage + 1])
-        found[stage] = np.where(each != 0.0, moved, 0.0).sum(axis=(0, 2))
-    return found
+        (columns,) = np.nonzero(row)
+        step_change[columns] = np.minimum(step_change[columns], slew.side / row[columns])
+    reachable = np.arange(1, len(c_powers) + 1)[:, None] * step_change
+    down, up = (np.minimum(reachable, side)[:, None] for side in (zero - lower, upper - zero))
+    reach: Array = np.empty(c_powers.shape[:2])
+    for stage in range(len(c_powers)):
+        effects = input_effects[stage::-1]  # of the inputs 0 … `stage`
+        with np.errstate(invalid="ignore"):  # ∞ · 0: an unlimited input without effect on the row
+            changes = np.where(effects > 0.0, effects * down[: stage + 1], -effects * up[: stage + 1])
+        reach[stage] = np.where(effects != 0.0, changes, 0.0).sum(axis=(0, 2))
+    return reach

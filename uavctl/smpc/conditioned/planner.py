@@ -1,20 +1,21 @@
 """Chance-constrained MPC with risk conditioned on the age of information: open-loop plans, back-offs by age.
 
-A plan is made at each new position and played out until the next one. So the plan that moved the vehicle to x(k) was
-based on information that was t = 1, 2 … steps old, with the probability π_t that the link's age of information gives,
-and disturbances are independent of losses. By total probability
+1. A plan is made at each new position and played out until the next one. So the plan that moved the vehicle to x(k) had
+   information t = 1, 2 … steps old, with the probabilities π_t of the link. Disturbances are independent of losses. By
+   total probability
 
-    P(x(k) not in X) = Σ_t π_t P(x(k) not in X | information t steps old) <= Σ_t π_t Σ_i ε_ti <= 1 - δ_x,
+       P(x(k) not in X) = Σ_t π_t P(x(k) not in X | information t steps old) <= Σ_t π_t Σ_i ε_ti <= 1 - δ_x
 
-where row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti, σ_ti² = c_i'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c_i with
-the estimate's own covariance P. The budget ε̄_t of an age is fixed, because plans of different ages share it at one
-moment; how a plan spreads ε̄_t over its rows is free (iterative risk allocation). `docs/theory.md` has statement and
-proof. Two spreads of ε̄_t are at hand: one for targets that leave room from all limits, one for the others and for
-motions, whose plans meet limits at any age.
-
-The cost is that of the regulator: with u_t = u_s + K(x_t - x_s) + c_t and its Riccati solution behind stage H it is
-|z|² in z = L'c, L L' = R + B'PB. Where z = 0 keeps all limits within the budgets it is the answer; elsewhere a
-strictly convex program is solved for each independent part that has to leave it.
+   if row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti, σ_ti² = c_i'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c_i with
+   the estimate's covariance P. `docs/theory.md` has statement and proof.
+2. The budget ε̄_t of an age is fixed, because plans of different ages share the risk of one moment. There are two
+   spreads of it: one for targets that leave room from all limits (transit), one for other targets and for motions,
+   whose plans meet limits at any age.
+3. A plan may spread ε̄_t over its rows as it likes (iterative risk allocation): programs and shifts of risk alternate
+   for a few rounds.
+4. The cost is that of the regulator. With u_t = u_s + K(x_t - x_s) + c_t and the Riccati solution after stage H it is
+   |z|² plus a constant, z = L'c, L L' = R + B'PB. If z = 0 keeps all limits within the budgets, it is the answer. Else
+   each independent part that violates a limit solves a strictly convex program.
 """
 
 from __future__ import annotations
@@ -32,21 +33,21 @@ from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite
 from uavctl.smpc.batch import Decisions, gather_answers
 from uavctl.smpc.conditioned.backoffs import (
-    DISTANT,
-    LARGEST_RISK,
+    DISTANT_SHARE,
+    MAX_RISK,
     PRICE,
     AgeRisk,
     Deviations,
     Flags,
-    age_risk,
-    binding,
-    equal_risk,
+    compute_rest_backoffs,
+    find_binding,
     quantile,
-    rest_backoffs,
-    shifted,
-    spent,
+    shift_risk,
+    spread_risk,
+    spread_risk_equally,
+    violation_risk,
 )
-from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestPlaces, SlewRows
+from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestEquilibria, SlewRows
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant, digest
@@ -58,39 +59,39 @@ if TYPE_CHECKING:
 
 
 METHOD = "age-conditioned"
-ROUNDS = 2  # programs of an allocation
-MOST_ROUNDS = (
-    3  # of one whose plan does not keep its back-offs: between two walls of a narrow room half of them need it
+ROUNDS = 2  # rounds of an allocation
+MAX_ROUNDS = (
+    3  # rounds if the plan does not keep its back-offs; half of the plans between two near walls need the third
 )
-MOST_SHIFTING = 300  # iterations of all programs so far, above which no more risk is shifted
+MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
 @dataclass(frozen=True, eq=False)
 class _Margins:
-    """Margins that a covariance and an age ask of the rows, in each stage."""
+    """Margins of the rows in each stage, for a covariance and an age."""
 
     sigma: Array  # standard deviations (H, m)
-    budgets: Array  # ε̄ of the stages (H,), infinite where nothing is asked
+    budgets: Array  # ε̄ of the stages (H,), infinite without a back-off
     backoff: Array  # back-offs (H, m) of rows that share the budgets equally
-    distant: Array  # standard deviations (H, 1) that rows keep at first which the regulator's plan is not near
+    distant: Array  # most standard deviations (H, 1) of rows that the regulator's plan is not near, at first
 
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """Spread of the risk over the ages, and what follows from it, by how late [steps] a position was."""
+    """Spread of the risk over the ages, and what follows from it for each age of a position [steps]."""
 
     risk: AgeRisk  # the spread
     budgets: Array  # ε̄ of the stages (H, H)
-    shared: Array  # quantiles of rows that share them equally (H, H, 1)
-    distant: Array  # quantiles of rows at first which the regulator's plan is not near (H, H, 1)
-    rest: Array  # distance of a plan at rest from each row (n, m), by how many rows are in the way of a target
+    shared: Array  # quantiles of rows that share the budgets equally (H, H, 1)
+    distant: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
+    rest_distances: Array  # distance of a plan at rest from each row (n, m), by the number of rows that limit a target
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """A plan beside the regulator's: what leaves it, the back-offs (H, m), the room (H, m) and the iterations."""
+class _PlanResult:
+    """A plan: z of each program that was solved, the back-offs (H, m), the room (H, m) and the iterations."""
 
-    left: Sequence[tuple[PartProgram, Array]]
+    z_of_program: Sequence[tuple[PartProgram, Array]]
     backoff: Array
     room: Array
     iterations: int
@@ -99,15 +100,15 @@ class _Found:
 class ConditionedSolver:
     """Answers from one strictly convex program for each independent part; never raises on numbers.
 
-    The reference is the equilibrium nearest to the target at which a plan may rest, see `rest_backoffs`. An answer
-    depends on its question alone, bit for bit. Not for concurrent use.
+    The reference is the equilibrium nearest to the target at which a plan may rest, see `compute_rest_backoffs`. An
+    answer depends on its question alone, bit for bit. Not for concurrent use.
 
     Args:
         problem: The problem; every question brings a target of its own.
-        allowed: 1 - δ_x, the share of time in which the state may be outside of its limits.
-        slew_mps3: How far the acceleration setpoint may go in a second [m/s³], see `SlewRows`; infinite: anywhere.
+        allowed: 1 - δ_x, allowed share of time outside of the state limits.
+        slew_mps3: Largest change of the acceleration setpoint in a second [m/s³], see `SlewRows`; infinite: no limit.
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
-        seen: The plant as the filter sees it, of n states: the plant's, then biases of its inputs; None: as it is.
+        filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
@@ -122,121 +123,130 @@ class ConditionedSolver:
         price: float = PRICE,
         slew_mps3: float = math.inf,
         cov: Array | None = None,
-        seen: Plant | None = None,
+        filter_plant: Plant | None = None,
     ) -> None:
         self.problem = problem
-        self.seen = problem.plant if seen is None else seen
+        self.filter_plant = problem.plant if filter_plant is None else filter_plant
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
         self._tail = law.p
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
-        found = find_parts(problem, self._slew.d)
-        moved = {int(state) for part in found for state in part.states}
-        if len(moved) < plant.n_x:
-            adrift = sorted(set(range(plant.n_x)) - moved)
-            raise DesignError("plant.b", f"states {adrift} are reached by no input", "give each state an input")
-        self._regulated = RegulatedRows(problem, law, found, self._slew)
-        self._deviations = Deviations(problem, found, self.seen)
+        parts = find_parts(problem, self._slew.d)
+        driven = {int(state) for part in parts for state in part.states}
+        if len(driven) < plant.n_x:
+            undriven = sorted(set(range(plant.n_x)) - driven)
+            raise DesignError("plant.b", f"states {undriven} are reached by no input", "give each state an input")
+        self._regulated = RegulatedRows(problem, law, parts, self._slew)
+        self._deviations = Deviations(problem, parts, self.filter_plant)
         self._rows = self._regulated.rows
         width, hard = self._rows.size, self._regulated.hard[-1].stop
         self._parts = [
-            PartProgram(problem, law, part, self._slew, columns, own, width, width * steps + hard)
-            for part, columns, own in zip(found, self._regulated.columns, self._regulated.hard, strict=True)
+            PartProgram(problem, law, part, self._slew, columns, hard_rows, width, width * steps + hard)
+            for part, columns, hard_rows in zip(parts, self._regulated.columns, self._regulated.hard, strict=True)
         ]
         self._in_order = bool((self._rows == np.arange(problem.state_set.b.size)).all())
         self._c, self._b = problem.state_set.c[self._rows], problem.state_set.b[self._rows]
         self._rests = find_equilibria(
             plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp)
         )
-        self._holds = bool(self._rests.u_eq.any())
-        self._places = [RestPlaces(problem, self._rests, part) for part in found]
-        placed = np.vstack([one.rows for one in self._places])
+        self._has_rest_input = bool(self._rests.u_eq.any())
+        self._rest_equilibria = [RestEquilibria(problem, self._rests, part) for part in parts]
+        placed = np.vstack([equilibria.rows for equilibria in self._rest_equilibria])
         self._resting = np.flatnonzero(np.any(placed != 0.0, axis=1))
         self._placed = placed[self._resting]
         self._box = all(np.count_nonzero(row) == 1 for row in problem.input_set.c)
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.zeros((steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
-        # Rooms of all rows less their back-offs, as programs take them, and which of them are of state rows (H, m).
+        # Rooms of all rows minus their back-offs, and the view of the state rows (H, m)
         self._rooms = np.full(width * steps + hard + 1, OPEN)
         self._rooms_x = self._rooms[: width * steps].reshape(steps, width)
-        self._taken = np.zeros((steps, width))  # of the room of state rows, by the plans of all parts so far
-        many = len(self._parts)
+        self._used_room = np.zeros((steps, width))  # room of state rows that all parts use so far
+        n_parts = len(self._parts)
 
         def spread(risk: AgeRisk) -> _Spread:
             ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-            budgets, rest = risk.shares[ages], np.zeros((many, width))
-            rest[:, self._resting] = rest_backoffs(
-                problem, risk, allowed, self._slew, self._c[self._resting], cov, many, self.seen
+            budgets, rest_distances = risk.shares[ages], np.zeros((n_parts, width))
+            rest_distances[:, self._resting] = compute_rest_backoffs(
+                problem, risk, allowed, self._slew, self._c[self._resting], cov, n_parts, self.filter_plant
             )
             shares = budgets / max(1, width)
-            return _Spread(risk, budgets, quantile(shares)[:, :, None], quantile(DISTANT * shares)[:, :, None], rest)
+            return _Spread(
+                risk,
+                budgets,
+                quantile(shares)[:, :, None],
+                quantile(DISTANT_SHARE * shares)[:, :, None],
+                rest_distances,
+            )
 
-        self._near = spread(age_risk(link, self._pacing(), allowed, price, many))
-        self._transit = spread(equal_risk(link, steps, allowed, many))
-        # A plan at rest there is seldom outside even at the oldest age with a back-off, so limits matter on the
-        # way alone.
+        self._near = spread(spread_risk(link, self._find_pacing_deviations(), allowed, price, n_parts))
+        self._transit = spread(spread_risk_equally(link, steps, allowed, n_parts))
+        # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
-        oldest = self._deviations.of(None)[max(0, counts - 1)]
-        self._far = np.maximum(self._transit.rest[-1], float(quantile(np.array(allowed / many))) * oldest)
-        # With plain limits, which nearly every plan has: up to where a target leaves room, and is in nobody's way.
+        oldest = self._deviations.compute(None)[max(0, counts - 1)]
+        self._far = np.maximum(self._transit.rest_distances[-1], float(quantile(np.array(allowed / n_parts))) * oldest)
+        # Without limits of a preview: bounds on a target that leaves room, and on one that needs no reference
         self._plain_far = (self._b - self._far)[self._resting]
-        self._plain_near = (self._b - self._near.rest[0])[self._resting]
-        self._last: tuple[tuple[bool, int, bytes], _Margins] | None = None
+        self._plain_near = (self._b - self._near.rest_distances[0])[self._resting]
+        self._cached_margins: tuple[tuple[bool, int, bytes], _Margins] | None = None
 
     @property
     def risk(self) -> AgeRisk:
-        """The risk by age beside limits and along motions."""
+        """Risk by age near limits and along motions."""
         return self._near.risk
 
     @property
-    def risk_in_transit(self) -> AgeRisk:
-        """The risk by age where the target leaves room."""
+    def transit_risk(self) -> AgeRisk:
+        """Risk by age where the target leaves room."""
         return self._transit.risk
 
-    def risk_towards(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
-        """The spread of a plan towards `target` (n_x,): by the target, the limits and whether there is a motion."""
-        return self._towards(self._placed.dot(target[self._rests.held]), self._limits(preview), preview).risk
+    def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
+        """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
+        return self._select_spread(self._placed.dot(target[self._rests.held]), self._limits(preview), preview).risk
 
-    def rests(self) -> Array:
-        """Right sides (m_x,) of the state rows, less what a plan keeps from them that rests, whatever others do."""
+    def rest_limits(self) -> Array:
+        """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self._near.rest[-1]
+        sides[self._rows] -= self._near.rest_distances[-1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
-        """Plan from `x` (n_x,) towards `target` (n_x,), an equilibrium; see `Solver`."""
+        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); see `Solver`."""
         if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         limits = self._limits(preview)
         placed = self._placed.dot(target[self._rests.held])
-        margins = self._margins(self._towards(placed, limits, preview), preview)
-        reference = self._reference(target, placed, limits)
-        hold = self._rests.u_eq @ reference[self._rests.held] if self._holds else None
-        first = None if preview.sent is None or not self._slew.axes.size else self._slew.first(preview.sent)
+        margins = self._find_margins(self._select_spread(placed, limits, preview), preview)
+        reference = self._find_reference(target, placed, limits)
+        rest_input = self._rests.u_eq @ reference[self._rests.held] if self._has_rest_input else None
+        first = (
+            None if preview.sent is None or not self._slew.axes.size else self._slew.measure_first_step(preview.sent)
+        )
         dx = x - reference
-        low, high, less = self._reach(preview)
-        room, hard = self._regulated.room(dx, limits - self._c @ reference, hold, first, less)
-        along: list[tuple[PartProgram, Array]] = []
+        lower, upper, tightening = self._find_input_bounds(preview)
+        room_x, hard = self._regulated.compute_room(dx, limits - self._c @ reference, rest_input, first, tightening)
+        path_z: list[tuple[PartProgram, Array]] = []
         if preview.path is not None:
-            along = [(one, one.along(preview.path.states, preview.path.inputs)) for one in self._parts]
-            for one, z in along:
-                one.take(z, room, hard)
-        found = self._spread(room, hard, margins)
-        if found is None:
+            path_z = [
+                (program, program.follow_path(preview.path.states, preview.path.inputs)) for program in self._parts
+            ]
+            for program, z in path_z:
+                program.subtract_room(z, room_x, hard)
+        result = self._spread(room_x, hard, margins)
+        if result is None:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         inputs, states = self._regulated.plan(dx)
-        for one, z in (*along, *found.left):
-            one.add(z, inputs, states)
-        cost, slack, relaxed = self._price(inputs, states, found, preview)
+        for program, z in (*path_z, *result.z_of_program):
+            program.add_to_plan(z, inputs, states)
+        cost, slack, relaxed = self._compute_cost(inputs, states, result, preview)
         if first is not None and max(first[1].tolist()) > self._slew.side + KEPT_TOLERANCE:
             relaxed += self._find_relaxed_slew(first[1])
         states += reference
         states[0] = x
-        if hold is not None:
-            inputs += hold
-        inputs, kept = self._inside(inputs, bool(found.left), low, high)
+        if rest_input is not None:
+            inputs += rest_input
+        inputs, kept = self._clip(inputs, bool(result.z_of_program), lower, upper)
         backoff_x = np.zeros((len(states), self.problem.state_set.b.size))
-        backoff_x[1:, slice(None) if self._in_order else self._rows] = found.backoff
+        backoff_x[1:, slice(None) if self._in_order else self._rows] = result.backoff
         offset = 0.0
         if reference is not target:
             offset = float(np.abs((reference - target)[self._rests.held]).sum())
@@ -253,24 +263,24 @@ class ConditionedSolver:
             offset=offset,
             terminal_miss=0.0,
             cost=cost,
-            cost_lower=-np.inf,  # the spread of the risk is no convex program, and each spread's is solved to rounding
+            cost_lower=-np.inf,  # the spread of the risk is not convex, and each program is solved to rounding
             gap=np.inf,
-            iterations=found.iterations,
+            iterations=result.iterations,
             relaxed=relaxed,
         )
 
     def _limits(self, preview: Preview) -> Array:
-        """Right sides of the state rows, in each stage (H, m) or in all alike (m,)."""
+        """Return the right sides of the state rows, of each stage (H, m) or of all (m,)."""
         limits: Array = self._b
         if preview.limits is not None:
             limits = preview.limits[1:] if self._in_order else preview.limits[1:, self._rows]
         return limits
 
-    def _towards(self, placed: Array, limits: Array, preview: Preview) -> _Spread:
-        """The spread that a plan has: no age may choose its own, so it goes by nothing that an age decides.
+    def _select_spread(self, placed: Array, limits: Array, preview: Preview) -> _Spread:
+        """Select the spread of a plan, by data that do not depend on the age: all ages must share one spread.
 
         Args:
-            placed: The rows that places of rest are in, at the target.
+            placed: Values of the rows of resting places at the target.
         """
         if preview.path is not None:
             return self._near
@@ -279,152 +289,167 @@ class ConditionedSolver:
             kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._resting]
         return self._transit if np.count_nonzero(placed <= kept) == kept.size else self._near
 
-    def _margins(self, spread: _Spread, preview: Preview) -> _Margins:
-        """Return the margins of a preview; the last ones are cached, by the exact bits that they are made of."""
+    def _find_margins(self, spread: _Spread, preview: Preview) -> _Margins:
+        """Return the margins of a preview; the last ones are cached, by the bits of their arguments."""
         key = spread is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
-        if self._last is None or self._last[0] != key:
-            sigma, late = self._deviations.of(preview.cov), min(preview.age, self.problem.horizon - 1)
-            self._last = key, _Margins(sigma, spread.budgets[late], spread.shared[late] * sigma, spread.distant[late])
-        return self._last[1]
+        if self._cached_margins is None or self._cached_margins[0] != key:
+            sigma, age = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
+            self._cached_margins = (
+                key,
+                _Margins(sigma, spread.budgets[age], spread.shared[age] * sigma, spread.distant[age]),
+            )
+        return self._cached_margins[1]
 
-    def _reference(self, target: Array, placed: Array, limits: Array) -> Array:
-        """The equilibrium (n_x,) that is nearest to the target; the rows that are in its way share the budgets."""
+    def _find_reference(self, target: Array, placed: Array, limits: Array) -> Array:
+        """Return the equilibrium (n_x,) nearest to the target; the rows that limit it share the budgets."""
         sides, kept = limits, self._plain_near
         if limits is not self._b:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
-            kept = (sides - self._near.rest[0])[self._resting]
+            kept = (sides - self._near.rest_distances[0])[self._resting]
         count = np.count_nonzero(placed > kept)
         if not count:
             return target
-        reference, rest = np.array(target), self._near.rest[min(int(count), len(self._parts)) - 1]
-        for one, places in zip(self._parts, self._places, strict=True):
-            places.nearest(reference, (sides - rest)[one.columns])
+        reference, distance = np.array(target), self._near.rest_distances[min(int(count), len(self._parts)) - 1]
+        for program, equilibria in zip(self._parts, self._rest_equilibria, strict=True):
+            equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
 
-    def _pacing(self) -> Array:
-        """Deviations (H,) by which the risk is spread over the ages: those of the position that wanders most."""
-        sigma, index = self._deviations.of(None), list(self.problem.plant.position_index)
+    def _find_pacing_deviations(self) -> Array:
+        """Return the deviations (H,) for the spread over the ages: those of the position with the largest one."""
+        sigma, index = self._deviations.compute(None), list(self.problem.plant.position_index)
         rows = np.any(self._c[:, index] != 0.0, axis=1)
         limited = sigma[:, rows] if rows.any() else sigma
         return np.asarray(limited[:, limited[-1].argmax()] if limited.size else np.zeros(len(sigma)))
 
-    def _spread(self, room: Array, hard: Array, margins: _Margins) -> _Found | None:
-        """Plans of all parts, the budgets spread over the rows of all of them in a few rounds.
+    def _spread(self, room: Array, hard: Array, margins: _Margins) -> _PlanResult | None:
+        """Plan all parts, and spread the budgets over the rows of all of them in a few rounds.
 
-        Rows that do not bind keep a share that still leaves half of their room, and those that bind get the rest. The
-        plan of one round keeps the limits of the next, so that no round costs more, and a part of which no state row
-        binds keeps its plan. Before the first one it is by the regulator's plan: a row that it leaves too little room
-        for an equal share in any stage counts as binding in all of them, and the others share half of a budget.
+        1. If the regulator's plan (z = 0) keeps all limits within the budgets, it is the result.
+        2. Else the first back-offs follow from it: a row without room for an equal share in any stage counts as binding
+           in all stages; the back-offs of the others are at most those for DISTANT_SHARE of an equal share.
+        3. Each round solves the programs of parts with violated or binding rows, then shifts risk from rows that do not
+           bind to those that do. The plan of a round keeps the back-offs of the next, so no round raises the cost.
 
         Args:
-            room: Room of the state rows where z = 0 (H, m).
+            room: Room of the state rows for z = 0 (H, m).
+            hard: Room of the hard rows for z = 0.
         """
         backoff, sigma, budgets = margins.backoff, margins.sigma, margins.budgets
-        over, tight = room < backoff, hard < 0.0
-        if not np.count_nonzero(tight):
-            if not np.count_nonzero(over):
-                return _Found((), backoff, room, 0)
-            stages = np.flatnonzero(over.any(axis=1))
-            within = spent(room[stages], sigma[stages])
-            if within.max() <= LARGEST_RISK and (within.sum(axis=1) <= budgets[stages]).all():
-                return _Found((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
-        near = np.logical_or.reduce(over, axis=0)
+        violated_x, violated = room < backoff, hard < 0.0
+        if not np.count_nonzero(violated):
+            if not np.count_nonzero(violated_x):
+                return _PlanResult((), backoff, room, 0)
+            stages = np.flatnonzero(violated_x.any(axis=1))
+            risk = violation_risk(room[stages], sigma[stages])
+            if risk.max() <= MAX_RISK and (risk.sum(axis=1) <= budgets[stages]).all():
+                return _PlanResult((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
+        near = np.logical_or.reduce(violated_x, axis=0)
         if np.count_nonzero(near):
-            backoff = shifted(backoff, room, sigma, budgets, over | near, margins.distant)
-            over = room < backoff
-        todo = [
-            one for one in self._parts if np.count_nonzero(tight[one.hard]) or np.count_nonzero(over[:, one.columns])
+            backoff = shift_risk(backoff, room, sigma, budgets, violated_x | near, margins.distant)
+            violated_x = room < backoff
+        programs = [
+            program
+            for program in self._parts
+            if np.count_nonzero(violated[program.hard]) or np.count_nonzero(violated_x[:, program.columns])
         ]
         self._rooms[room.size : -1] = hard
-        self._taken.fill(0.0)
-        left: dict[PartProgram, Array] = {}
-        found, now = None, room
+        self._used_room.fill(0.0)
+        z_of_program: dict[PartProgram, Array] = {}
+        result, room_left = None, room
         iterations = 0
-        for number in range(MOST_ROUNDS):
-            if number:
-                if number >= ROUNDS and (backoff - now).max() <= KEPT_TOLERANCE:
+        for round_number in range(MAX_ROUNDS):
+            if round_number:
+                if round_number >= ROUNDS and (backoff - room_left).max() <= KEPT_TOLERANCE:
                     break
-                binds = binding(backoff, now, sigma)
-                todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
-                if not todo or iterations > MOST_SHIFTING:
+                binds = find_binding(backoff, room_left, sigma)
+                programs = [program for program in programs if np.count_nonzero(binds[:, program.columns])]
+                if not programs or iterations > MAX_SHIFT_ITERATIONS:
                     break
-                span = _stages(binds)
+                span = _span_stages(binds)
                 backoff = backoff.copy()
-                backoff[span] = shifted(backoff[span], now[span], sigma[span], budgets[span], binds[span])
+                backoff[span] = shift_risk(backoff[span], room_left[span], sigma[span], budgets[span], binds[span])
             np.subtract(room, backoff, out=self._rooms_x)
-            left = dict(left)
-            for one in todo:
-                z = one.solve(self._rooms, again=number > 0)
-                iterations += one.iterations
+            z_of_program = dict(z_of_program)
+            for program in programs:
+                z = program.solve(self._rooms, reuse_rows=round_number > 0)
+                iterations += program.iterations
                 if z is None:
-                    return found
-                left[one] = z
-                one.leave(z, self._taken)
-            now = room - self._taken
-            found = _Found(tuple(left.items()), backoff, now, iterations)
-        return found
+                    return result
+                z_of_program[program] = z
+                program.write_used_room(z, self._used_room)
+            room_left = room - self._used_room
+            result = _PlanResult(tuple(z_of_program.items()), backoff, room_left, iterations)
+        return result
 
-    def _price(self, du: Array, dx: Array, found: _Found, preview: Preview) -> tuple[float, float, tuple[GaveWay, ...]]:
-        """Cost of a plan, from its deviations (H, n_u) and (H+1, n_x), the sum of its slacks, and what they are."""
+    def _compute_cost(
+        self, du: Array, dx: Array, result: _PlanResult, preview: Preview
+    ) -> tuple[float, float, tuple[GaveWay, ...]]:
+        """Return the cost of a plan from its deviations (H, n_u), (H+1, n_x), the sum of its slacks, and the slacks."""
         problem = self.problem
         if preview.path is None:
-            # The regulator's own cost, and the square of the deviation from it.
-            cost = dx[0] @ self._tail @ dx[0] + sum([z.dot(z) for _, z in found.left])
+            # x_0'P x_0 + |z|²
+            cost = dx[0] @ self._tail @ dx[0] + sum([z.dot(z) for _, z in result.z_of_program])
         else:
+            # Σ_t (x_t - p_t)'Q_x(x_t - p_t) + (u_t - r_t)'Q_u(u_t - r_t) + x_H'P x_H
             last, dx, du = dx[-1], dx[:-1] - preview.path.states, du - preview.path.inputs
             cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
-        if not found.left:
+        if not result.z_of_program:
             return float(cost), 0.0, ()
-        over = np.maximum(found.backoff - found.room, 0.0)
-        slack = float(over.sum())
+        excess = np.maximum(result.backoff - result.room, 0.0)
+        slack = float(excess.sum())
         if slack == 0.0:
             return float(cost), 0.0, ()
-        cost += problem.slack_linear * slack + problem.slack_quadratic * np.vdot(over, over)
+        # + Σ ρ_1 s + ρ_2 s²
+        cost += problem.slack_linear * slack + problem.slack_quadratic * np.vdot(excess, excess)
         if slack <= KEPT_TOLERANCE:  # rounding
             return float(cost), slack, ()
-        stages, columns = (over > KEPT_TOLERANCE).nonzero()
+        stages, columns = (excess > KEPT_TOLERANCE).nonzero()
         relaxed = tuple(
             GaveWay(constraint="state", stage=t + 1, index=i, amount=amount)
             for t, i, amount in zip(
-                stages.tolist(), self._rows[columns].tolist(), over[stages, columns].tolist(), strict=True
+                stages.tolist(), self._rows[columns].tolist(), excess[stages, columns].tolist(), strict=True
             )
         )
         return float(cost), slack, relaxed
 
     def _find_relaxed_slew(self, side: Array) -> tuple[GaveWay, ...]:
-        """The rows of the first step that leave more than the gate lets through, by `side` (m,)."""
-        over = side - self._slew.side
+        """Return the slew rows of the first step whose `side` (m,) is beyond the gate's."""
+        excess = side - self._slew.side
         return tuple(
-            GaveWay(constraint="slew", stage=0, index=int(self._slew.axes[i]), amount=float(over[i]))
-            for i in np.flatnonzero(over > KEPT_TOLERANCE)
+            GaveWay(constraint="slew", stage=0, index=int(self._slew.axes[i]), amount=float(excess[i]))
+            for i in np.flatnonzero(excess > KEPT_TOLERANCE)
         )
 
-    def _reach(self, preview: Preview) -> tuple[Array, Array, Array | None]:
-        """Return the least and the largest inputs of each stage, and how much smaller the rows of U are for it (m,)."""
+    def _find_input_bounds(self, preview: Preview) -> tuple[Array, Array, Array | None]:
+        """Return the smallest and largest inputs of each stage, and the reduction of the rows of U (m,)."""
         if preview.inputs is None or not self._box:
             return self._low, self._high, None
-        low, high = (side.clip(self._low[0], self._high[0]) for side in preview.inputs)
+        lower, upper = (side.clip(self._low[0], self._high[0]) for side in preview.inputs)
         c, b = self.problem.input_set.c, self.problem.input_set.b
         column = (c != 0.0).argmax(axis=1)
-        each = c[np.arange(len(b)), column]
-        return low, high, np.where(np.isfinite(b), b - np.maximum(each * low[column], each * high[column]), 0.0)
+        coefficients = c[np.arange(len(b)), column]
+        return (
+            lower,
+            upper,
+            np.where(np.isfinite(b), b - np.maximum(coefficients * lower[column], coefficients * upper[column]), 0.0),
+        )
 
-    def _inside(self, inputs: Array, solved: bool, low: Array, high: Array) -> tuple[Array, bool]:
-        """Inputs (H, n_u) within their limits to the last bit, and whether they were but for rounding."""
+    def _clip(self, inputs: Array, solved: bool, lower: Array, upper: Array) -> tuple[Array, bool]:
+        """Return inputs (H, n_u) clipped to their limits, and whether they were within them but for rounding."""
         if not self._box:
             return clip_inputs(inputs, self.problem.input_set.c, self.problem.input_set.b)
-        cut: Array = np.minimum(np.maximum(inputs, low), high)
-        return cut, not solved or float(np.abs(cut - inputs).max()) <= INPUT_TOLERANCE
+        clipped: Array = np.minimum(np.maximum(inputs, lower), upper)
+        return clipped, not solved or float(np.abs(clipped - inputs).max()) <= INPUT_TOLERANCE
 
 
-def _stages(flags: Flags) -> slice:
-    """From the first stage in which a row has its flag (H, m) to the last one; there is one."""
-    rows, each = flags.ravel(), flags.shape[1]
-    return slice(int(rows.argmax()) // each, (rows.size - 1 - int(rows[::-1].argmax())) // each + 1)
+def _span_stages(flags: Flags) -> slice:
+    """Return the slice from the first stage with a flag (H, m) to the last one; there must be one."""
+    rows, columns = flags.ravel(), flags.shape[1]
+    return slice(int(rows.argmax()) // columns, (rows.size - 1 - int(rows[::-1].argmax())) // columns + 1)
 
 
 class ConditionedDecider:
-    """Decisions of a campaign, whose controllers are told the state of a step, how old it is, and its error if any.
+    """Decisions of a campaign, from the state of a step, its age, and the covariance of its error.
 
     Args:
         target: Equilibrium to go to (n_x,).
@@ -432,12 +457,12 @@ class ConditionedDecider:
 
     def __init__(self, solver: ConditionedSolver, target: Array) -> None:
         self._solver, self._target = solver, target
-        self._unseen = propagate_covariance(solver.problem.plant, solver.problem.horizon)
+        self._prediction_cov = propagate_covariance(solver.problem.plant, solver.problem.horizon)
 
-    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
+    def decide(self, x: Array, age: int, cov: Array | None = None) -> Decisions:
         """See `Decider`."""
-        exact, problem = Preview(age=late, cov=self._unseen[late] if late else None), self._solver.problem
-        previews = [exact] * len(x) if cov is None else [Preview(age=late, cov=one) for one in cov]
+        exact, problem = Preview(age=age, cov=self._prediction_cov[age] if age else None), self._solver.problem
+        previews = [exact] * len(x) if cov is None else [Preview(age=age, cov=error_cov) for error_cov in cov]
         answers = [
             self._solver.solve(i, row, self._target, preview)
             for i, (row, preview) in enumerate(zip(x, previews, strict=True))
@@ -445,30 +470,27 @@ class ConditionedDecider:
         return gather_answers(answers, (problem.horizon, problem.plant.n_u))
 
 
-# Design for flights with risk conditioned on the age: the counterpart of a design, made at once.
-
-
-_SETTLED = 2.0 / 3.0  # of the horizon: a plan along a motion rests from there on, whatever that asks of the inputs
+_SETTLED = 2.0 / 3.0  # share of the horizon after which a plan along a motion rests
 
 
 @dataclass(frozen=True, eq=False)
 class ConditionedDesign:
-    """A solver with risk conditioned on the age, what it is called, and where its plans may rest."""
+    """Design for flights with risk conditioned on the age: solver, hash, and limits of resting plans."""
 
     solver: ConditionedSolver  # the solver
-    # Covariance (n, n) of the estimate's error after a position, which `rests` counts on; with biases of the inputs
+    # Covariance (n, n) of the estimate's error after a position, used in `rest_limits`; with biases of the inputs
     # behind the states where the filter estimates them
     estimate_cov: Array
-    design_id: str  # hash of all that its answers depend on; the target, which every question brings, is none of it
-    # Right sides (m_x,) of the state rows, less what a plan keeps from them that rests; from the others
-    rests: Array = field(init=False, repr=False)
+    design_id: str  # hash of all that its answers depend on, without the target, which is part of each question
+    # Right sides (m_x,) of the state rows minus the distance of a plan at rest; derived
+    rest_limits: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rests", self.solver.rests())
+        object.__setattr__(self, "rest_limits", self.solver.rest_limits())
 
     @property
     def plant(self) -> Plant:
-        """The plant that is planned with."""
+        """Plant of the predictions."""
         return self.solver.problem.plant
 
     @property
@@ -487,7 +509,7 @@ class ConditionedDesign:
         return self.solver.problem.horizon
 
     @property
-    def settles(self) -> int:
+    def rest_stage(self) -> int:
         """Stage from which a plan along a motion rests [steps]."""
         return max(1, round(_SETTLED * self.horizon))
 
@@ -496,15 +518,15 @@ AnyDesign: TypeAlias = "Design | ConditionedDesign"  # design of either scheme
 
 
 def conditioned_id(
-    problem: ControlProblem, link: AgeModel, allowed: float, slew_mps3: float, cov: Array, seen: Plant | None
+    problem: ControlProblem, link: AgeModel, allowed: float, slew_mps3: float, cov: Array, filter_plant: Plant | None
 ) -> str:
-    """Hash of what `ConditionedSolver` is made from."""
+    """Return the hash of the arguments of `ConditionedSolver`, without the target."""
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
-    return digest((METHOD, anywhere, link, allowed, slew_mps3, cov, seen))
+    return digest((METHOD, anywhere, link, allowed, slew_mps3, cov, filter_plant))
 
 
 def conditioned_record(design: ConditionedDesign) -> dict[str, object]:
-    """The design as plain numbers, for recordings and `uavctl design --json`."""
+    """Return the design as plain numbers, for recordings and `uavctl design --json`."""
     plant, problem, risk = design.plant, design.solver.problem, design.solver.risk
     return {
         "scheme": METHOD,
@@ -518,9 +540,9 @@ def conditioned_record(design: ConditionedDesign) -> dict[str, object]:
         "target": design.target.tolist(),
         "weights": risk.weights.tolist(),
         "budgets": risk.budgets.tolist(),
-        "budgets_in_transit": design.solver.risk_in_transit.budgets.tolist(),
-        "beyond": risk.beyond,
-        "rests": design.rests.tolist(),
+        "budgets_in_transit": design.solver.transit_risk.budgets.tolist(),
+        "beyond": risk.older_probability,
+        "rests": design.rest_limits.tolist(),
         "a": plant.a.tolist(),
         "b": plant.b.tolist(),
         "e": plant.e.tolist(),

@@ -1,10 +1,10 @@
-"""Conic programs with constant matrices: only the linear term and the right side follow the parameters.
+"""Conic programs for Clarabel with constant matrices; the linear term and the right side depend on parameters.
 
-minimise ½ zᵀPz + q(p)ᵀz + c(p)  subject to  E z + F p + g in a product of cones, for Clarabel.
-
-Clarabel sees the variables in units of their natural size and relative to an origin that follows the parameters, the
-cost in units of its size, and rows with a largest entry of 1. So its tolerances mean the same in any units, and a
-question far from the usual still has small numbers for an answer.
+1. min ½ z'Pz + q(p)'z + c(p)  subject to  E z + F p + g in a product of cones.
+2. `ProgramBuilder` collects rows and cost terms as expressions affine in variables z and parameters p.
+3. `ConicProgram` is set up once. Clarabel gets the variables in units of their natural size, relative to an origin that
+   depends on the parameters, the cost in units of its size, and rows with a largest entry of 1. So its tolerances mean
+   the same in any units, and an unusual question still has an answer in small numbers.
 """
 
 from __future__ import annotations
@@ -20,25 +20,22 @@ from scipy import sparse
 from uavctl.arrays import Array
 from uavctl.smpc.sets import Scale
 
-# Settings of Clarabel for direct calls.
-
-
-# The optimum is to be right to 1e-7. With a smaller gap the linear algebra may run out of digits before the end.
+# For an optimum accurate to 1e-7. With a smaller gap the linear algebra may lose all digits before the end.
 GAP_TOLERANCE = 1e-8
 RESIDUAL_TOLERANCE = 1e-8
 
-# A factorisation by blocks pays for long horizons only: at H = 40 it takes a third of the time.
+# Rows from which a factorisation by blocks is faster: at H = 40 it takes a third of the time.
 _MANY_ROWS = 900
 
 
 def conic_settings(max_iterations: int, rows: int) -> clarabel.DefaultSettings:
-    """Settings for a program of so many rows: one thread, and no change of the problem's shape."""
+    """Return settings for a program with `rows` rows: one thread, and no change of the problem's shape."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_iter = max_iterations
     settings.max_threads = 1
     settings.direct_solve_method = "faer" if rows > _MANY_ROWS else "qdldl"
-    # Both would change the shape of the data that update() replaces, and of the multipliers.
+    # Both would change the shape of the data in update(), and of the multipliers.
     settings.presolve_enable = False
     settings.chordal_decomposition_enable = False
     settings.tol_gap_abs = settings.tol_gap_rel = GAP_TOLERANCE
@@ -48,12 +45,12 @@ def conic_settings(max_iterations: int, rows: int) -> clarabel.DefaultSettings:
 
 Result = TypeVar("Result")
 
-# A linear cost above _STEEPEST, as far outside the limits, would pass for an unbounded problem: it becomes _STEEP.
-_STEEPEST = 1e8
-_STEEP = 1e3
+# A linear cost above _MAX_SLOPE, as far outside the limits, looks like an unbounded problem: it becomes _SCALED_SLOPE.
+_MAX_SLOPE = 1e8
+_SCALED_SLOPE = 1e3
 
-# Origins beyond this many natural sizes leave less than half of the digits to the answer.
-_FARTHEST = 1e8
+# Larger origins, in natural sizes, leave less than half of the digits to the answer.
+_MAX_ORIGIN = 1e8
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +80,8 @@ class Expression:
         return Expression(self.var, self.par, self.const + constant)
 
 
-def join(*parts: Expression) -> Expression:
-    """Expressions below one another."""
+def join_rows(*parts: Expression) -> Expression:
+    """Stack expressions."""
     return Expression(
         np.vstack([part.var for part in parts]),
         np.vstack([part.par for part in parts]),
@@ -97,7 +94,7 @@ Origin = Callable[[Array], Array]
 
 @dataclass(eq=False)
 class ProgramBuilder:
-    """Collects rows and cost terms over `n_var` variables and `n_par` parameters."""
+    """Builder of a program with `n_var` variables and `n_par` parameters, from rows and cost terms."""
 
     n_var: int
     n_par: int
@@ -112,12 +109,12 @@ class ProgramBuilder:
         self._c = 0.0
 
     def variable(self, where: slice) -> Expression:
-        """The variables of a slice."""
+        """Return the variables of a slice as an expression."""
         rows = range(*where.indices(self.n_var))
         return Expression(np.eye(self.n_var)[where], np.zeros((len(rows), self.n_par)), np.zeros(len(rows)))
 
     def parameter(self, where: slice) -> Expression:
-        """The parameters of a slice."""
+        """Return the parameters of a slice as an expression."""
         rows = range(*where.indices(self.n_par))
         return Expression(np.zeros((len(rows), self.n_var)), np.eye(self.n_par)[where], np.zeros(len(rows)))
 
@@ -161,22 +158,22 @@ class ProgramBuilder:
         """
         scale = Scale(np.ones(self.n_var), 1.0) if scale is None else scale
         d, root = scale.variables, np.sqrt(scale.cost)
-        squares = join(*self._squares) if self._squares else self.variable(slice(0, 0))
+        squares = join_rows(*self._squares) if self._squares else self.variable(slice(0, 0))
         squares = Expression(squares.var * d / root, squares.par / root, squares.const / root)
         groups: list[tuple[Expression, clarabel.Cone]] = []
         if self._zero:
-            zero = _unit_rows(join(*self._zero), d)
+            zero = _scale_rows(join_rows(*self._zero), d)
             groups.append((zero, clarabel.ZeroConeT(zero.const.size)))
         if self._nonneg:
-            nonneg = _unit_rows(join(*self._nonneg), d)
+            nonneg = _scale_rows(join_rows(*self._nonneg), d)
             groups.append((nonneg, clarabel.NonnegativeConeT(nonneg.const.size)))
-        groups += [(_unit_block(expression, d), cone) for expression, cone in self._cones]
+        groups += [(_scale_block(expression, d), cone) for expression, cone in self._cones]
         return ConicProgram(
             p=self._p * np.outer(d, d) / scale.cost + 2.0 * squares.var.T @ squares.var,
             q=self._q * d / scale.cost,
             c=self._c / scale.cost,
             squares=squares,
-            rows=join(*(expression for expression, _ in groups)),
+            rows=join_rows(*(expression for expression, _ in groups)),
             cones=[cone for _, cone in groups],
             max_iterations=max_iterations,
             scale=scale,
@@ -184,16 +181,16 @@ class ProgramBuilder:
         )
 
 
-def _unit_rows(rows: Expression, sizes: Array) -> Expression:
-    """Rows over variables in units of `sizes`, each with a largest coefficient of 1."""
+def _scale_rows(rows: Expression, sizes: Array) -> Expression:
+    """Scale rows to variables in units of `sizes`, each row to a largest coefficient of 1."""
     var = rows.var * sizes
     largest = np.abs(var).max(axis=1, initial=0.0)
     factor = 1.0 / np.where(largest > 0.0, largest, 1.0)
     return Expression(factor[:, None] * var, factor[:, None] * rows.par, factor * rows.const)
 
 
-def _unit_block(block: Expression, sizes: Array) -> Expression:
-    """The same with one factor for all rows of a cone."""
+def _scale_block(block: Expression, sizes: Array) -> Expression:
+    """Scale the rows of a cone alike, with one factor for all of them."""
     var = block.var * sizes
     largest = float(np.abs(var).max(initial=0.0))
     factor = 1.0 / largest if largest > 0.0 else 1.0
@@ -214,19 +211,19 @@ class Solution:
     iterations: int  # interior-point iterations
 
 
-def unless_panic(call: Callable[[], Result]) -> Result | None:
-    """Return what `call` returns, None if Clarabel panics in it; everything else that is raised passes."""
+def catch_panic(call: Callable[[], Result]) -> Result | None:
+    """Return the result of `call`, None if Clarabel panics; other exceptions pass."""
     try:
         return call()
     except BaseException as error:
-        # A panic of the solver's own code is no Exception, and its class cannot be imported.
+        # A panic of the solver's Rust code is no Exception, and its class cannot be imported.
         if type(error).__name__ != "PanicException":
             raise
         return None
 
 
 class ConicProgram:
-    """A program that is set up once and solved for many parameters."""
+    """Program that is set up once and solved for many parameters."""
 
     def __init__(
         self,
@@ -252,12 +249,13 @@ class ConicProgram:
         self._a = sparse.csc_array(-rows.var)
         self._cones = cones
         self._max_iterations = max_iterations
-        # The first numbers fix the solver's own scaling, so they are the program's, not a question's.
+        # The first numbers fix the solver's scaling: they must not depend on a question.
         self._solver = self._set_up(self._q_const, self._b_const)
 
     def solve(self, parameters: Array) -> Solution:
-        """Solve for `parameters` (n_p,); the same parameters give the same bits, whatever was solved before."""
+        """Solve for `parameters` (n_p,); the same parameters give the same bits, after any other solves."""
         with np.errstate(over="ignore", invalid="ignore"):
+            # c = c_0 + |r(p)|²,  q(p) = q_0 + Q p,  b(p) = b_0 + F p
             residual = self._square_par @ parameters + self._square_const
             constant = self._c + float(residual @ residual)
             q = self._q_const + self._q_par @ parameters
@@ -265,14 +263,15 @@ class ConicProgram:
             origin = np.zeros(q.size)
             if self._origin is not None:
                 origin = self._scale.excess_over_usual(self._origin(parameters))
+                # z = z_0 + δ:  c += ½ z_0'P z_0 + q'z_0,  q += P z_0,  b -= A z_0
                 slope = self._p @ origin
                 constant += float((q + 0.5 * slope) @ origin)
                 q, b = q + slope, b - self._a @ origin
-        known = np.isfinite(constant) and np.all(np.isfinite(q)) and np.all(np.isfinite(b))
-        if not known or np.abs(origin).max(initial=0.0) > _FARTHEST:
-            return self._breakdown()
-        steepest = float(np.abs(q).max(initial=0.0))
-        cost = steepest / _STEEP if steepest > _STEEPEST else 1.0
+        is_finite = np.isfinite(constant) and np.all(np.isfinite(q)) and np.all(np.isfinite(b))
+        if not is_finite or np.abs(origin).max(initial=0.0) > _MAX_ORIGIN:
+            return self._make_breakdown()
+        max_slope = float(np.abs(q).max(initial=0.0))
+        cost = max_slope / _SCALED_SLOPE if max_slope > _MAX_SLOPE else 1.0
 
         def run() -> clarabel.DefaultSolution:
             if cost != 1.0:
@@ -280,10 +279,10 @@ class ConicProgram:
             self._solver.update(q=q, b=b)
             return self._solver.solve()
 
-        result = unless_panic(run)
+        result = catch_panic(run)
         if result is None:
             self._solver = self._set_up(self._q_const, self._b_const)
-            return self._breakdown()
+            return self._make_breakdown()
         return Solution(
             status=str(result.status),
             variables=(np.array(result.x) + origin) * self._scale.variables,
@@ -292,12 +291,12 @@ class ConicProgram:
             iterations=result.iterations,
         )
 
-    def _breakdown(self) -> Solution:
+    def _make_breakdown(self) -> Solution:
         return Solution(BREAKDOWN, np.full(self._q_const.size, np.nan), np.nan, np.nan, 0)
 
     def _set_up(self, q: Array, b: Array, cost: float = 1.0) -> clarabel.DefaultSolver:
         settings = conic_settings(self._max_iterations, b.size)
-        # Where the terminal condition's interior is thin, the solver's own values run out of digits before the end.
+        # Where the terminal condition has a thin interior, Clarabel's defaults lose all digits before the end.
         settings.static_regularization_constant = 1e-9
         settings.max_step_fraction = 0.97
         p = sparse.triu(self._p / cost, format="csc")

@@ -1,4 +1,10 @@
-"""A design, frozen; its record; risk factors."""
+"""Design of scheme `hahn-stursberg`: all that the decision problem is made of, checked against Assumption 4.
+
+1. `kappa` turns a likelihood γ into the factor of a back-off: κ standard deviations.
+2. `make_design` chooses a schedule by its rule, makes the terminal ingredients, and checks Assumption 4. Rule `search`
+   takes the nested schedule of least mean cost over given states.
+3. `design_record` is the design as plain numbers.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +19,7 @@ from scipy.special import gammaincinv, ndtri
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
-from uavctl.smpc.hahn_stursberg.schedule import Schedule, ScheduleDemand, fixed, greedy, nested
+from uavctl.smpc.hahn_stursberg.schedule import Schedule, ScheduleDemand, list_nested, make_fixed, make_greedy
 from uavctl.smpc.hahn_stursberg.terminal import (
     AssumptionCheck,
     Terminal,
@@ -25,31 +31,26 @@ from uavctl.smpc.link import LinkModel, age_cdf
 from uavctl.smpc.plant import Plant, count_reach_steps, digest
 from uavctl.smpc.sets import Polytope
 
-# Risk allocation: how a likelihood becomes the factor of a back-off.
-
-
 Allocation = Literal["ellipsoid", "halfspace"]
 
 
 def kappa(gamma: float, n: int, rows: int, allocation: Allocation) -> float:
-    """κ: how many standard deviations a row keeps away from its limit.
+    """Return κ, the distance of a row from its limit in standard deviations.
 
     Args:
-        gamma: Likelihood that the whole vector has to be inside with.
-        allocation: `ellipsoid`: sqrt of the χ² quantile with n degrees of freedom, as printed; `halfspace`: Boole's
-            inequality, the same share of the risk for each row, with Gaussian quantiles.
+        gamma: Likelihood γ of the whole vector.
+        allocation: `ellipsoid`: root of the χ² quantile with n degrees of freedom, as printed; `halfspace`: Gaussian
+            quantiles with an equal share of the risk for each row (Boole).
     """
+    # (9): κ² = χ²_n(γ);  or κ = Φ⁻¹(1 - (1 - γ) / rows)
     if allocation == "ellipsoid":
         return float(np.sqrt(2.0 * gammaincinv(0.5 * n, gamma)))
     return float(-ndtri((1.0 - gamma) / max(1, rows)))
 
 
-# A complete design: what the decision problem is made from, checked against Assumption 4 and frozen.
-
-
 Rule = Literal["fixed", "search", "greedy"]
-# A candidate costs one program built and solved for each search state: this many are minutes.
-MOST_CANDIDATES = 500
+# Each candidate is a program, built and solved for each search state: this many take minutes.
+MAX_CANDIDATES = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,7 @@ class DesignSpec:
     delta_tau: float
     k_tau: Array
     link: LinkModel  # model of the link
-    target_m: Vec3  # where the terminal set has to fit the limits, local NED [m]
+    target_m: Vec3  # center of the terminal set, which must fit the limits, local NED [m]
     rule: Rule
     delays: int | Sequence[int]
     gamma_max: float
@@ -79,7 +80,7 @@ class DesignSpec:
     offset_weight: float
     terminal_weight: float
     max_iterations: int
-    # Likelihoods by the exact probability that all stages' feedback is usable, not by the product (6)
+    # Likelihoods by the joint probability that all stages' feedback is usable, not by the product (6)
     joint: bool = False
     # Covariance of the state estimate's error (n_x, n_x); None: the state is known exactly
     estimate_cov: Array | None = None
@@ -87,7 +88,7 @@ class DesignSpec:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Everything that a solver reads."""
+    """All data of a solver; the names of fields are part of the hash."""
 
     plant: Plant  # the plant
     state_set: Polytope  # X, m_x rows
@@ -108,13 +109,13 @@ class Design:
     terminal_weight: float  # l1 weight of a missed terminal equality
     max_iterations: int  # bound of the interior-point method
     estimate_cov: Array  # covariance of the state estimate's error (n_x, n_x), part of every state's back-off
-    past: int  # age of the position that a plan is based on [steps]: disturbances since then are unknown to it
-    late: tuple[Design, ...]  # the same design for plans that are based on positions 1, 2 … steps old
+    past: int  # age of the position that a plan is based on [steps]; disturbances since then are unknown
+    late: tuple[Design, ...]  # designs for plans based on positions 1, 2 … steps old
     assumptions: tuple[AssumptionCheck, ...]  # assumption 4, item by item
     design_id: str  # hash of all the above
 
     @property
-    def settles(self) -> int:
+    def rest_stage(self) -> int:
         """N, the stage from which a plan rests [steps]."""
         return self.horizon - self.terminal.tau
 
@@ -132,14 +133,14 @@ def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | Non
     demand = ScheduleDemand(spec.link, spec.horizon, spec.tau, spec.delta_x, spec.delta_u, spec.joint)
     terminal = make_terminal(spec.plant, spec.tau, spec.k_tau, spec.q_x, spec.q_u)
     if spec.rule == "fixed":
-        return assembled(spec, fixed(demand, spec.delays), terminal)
+        return assemble_design(spec, make_fixed(demand, spec.delays), terminal)
     if spec.rule == "greedy":
-        return assembled(spec, greedy(demand, spec.gamma_max), terminal)
+        return assemble_design(spec, make_greedy(demand, spec.gamma_max), terminal)
     return _search(spec, demand, terminal, cost_of)
 
 
 def _check_horizon(spec: DesignSpec) -> None:
-    """The mean is at the target from stage N = H - τ on: N steps have to suffice from any state."""
+    """Check that N = H - τ steps reach the target from any state, since the mean rests from stage N on."""
     free, least = spec.horizon - spec.tau, count_reach_steps(spec.plant)
     if free < least:
         raise DesignError(
@@ -156,45 +157,45 @@ def _search(
     terminal: Terminal,
     cost_of: Callable[[Design, Array], float | None] | None,
 ) -> Design:
-    """Least mean cost over the named states among the nested schedules that keep all of them feasible."""
+    """Find the nested schedule of least mean cost over the search states, feasible for all of them."""
     if cost_of is None:
         raise DesignError("schedule.rule", "rule `search` has no cost to minimise here", "use rule `fixed` or `greedy`")
     if not len(spec.search_states):
         raise DesignError(
             "schedule.search_states", "rule `search` has no states to minimise the cost over", "name some"
         )
-    candidates = list(islice(nested(demand, spec.gamma_max), MOST_CANDIDATES + 1))
-    if len(candidates) > MOST_CANDIDATES:
+    candidates = list(islice(list_nested(demand, spec.gamma_max), MAX_CANDIDATES + 1))
+    if len(candidates) > MAX_CANDIDATES:
         raise DesignError(
             "schedule.rule",
-            f"`search` has more than {MOST_CANDIDATES} nested schedules to try at H = {spec.horizon}",
+            f"`search` has more than {MAX_CANDIDATES} nested schedules to try at H = {spec.horizon}",
             "take a shorter smpc.horizon, a lower schedule.gamma_max, or rule `greedy`",
         )
     best: tuple[float, Design] | None = None
-    refused, why = 0, ""
+    n_refused, last_reason = 0, ""
     for schedule in candidates:
         try:
-            design = assembled(spec, schedule, terminal)
-        except DesignError as error:  # this schedule's likelihoods ask for more than the limits leave
-            refused, why = refused + 1, f": {error.reason}"
+            design = assemble_design(spec, schedule, terminal)
+        except DesignError as error:  # the limits leave no room for these likelihoods
+            n_refused, last_reason = n_refused + 1, f": {error.reason}"
             continue
         costs = [cost_of(design, state) for state in spec.search_states]
-        known = [cost for cost in costs if cost is not None]
-        mean = float(np.mean(known)) if len(known) == len(costs) else np.inf
+        known_costs = [cost for cost in costs if cost is not None]
+        mean = float(np.mean(known_costs)) if len(known_costs) == len(costs) else np.inf
         if np.isfinite(mean) and (best is None or mean < best[0]):
             best = (mean, design)
     if best is None:
         raise DesignError(
             "schedule.rule",
-            f"none of {len(candidates)} nested schedules will do: {refused} fail Assumption 4, "
-            f"{len(candidates) - refused} leave one of the {len(spec.search_states)} states infeasible{why}",
+            f"none of {len(candidates)} nested schedules will do: {n_refused} fail Assumption 4, "
+            f"{len(candidates) - n_refused} leave one of the {len(spec.search_states)} states infeasible{last_reason}",
             "name states that are easier, raise schedule.gamma_max, or use rule `fixed`",
         )
     return best[1]
 
 
-def assembled(spec: DesignSpec, schedule: Schedule, terminal: Terminal, past: int = 0) -> Design:
-    """The design with a given schedule and terminal law, for positions that are `past` steps old.
+def assemble_design(spec: DesignSpec, schedule: Schedule, terminal: Terminal, past: int = 0) -> Design:
+    """Assemble the design of a schedule and a terminal law, for positions `past` steps old.
 
     Raises:
         DesignError: An item of Assumption 4 fails.
@@ -222,7 +223,7 @@ def assembled(spec: DesignSpec, schedule: Schedule, terminal: Terminal, past: in
         estimate_cov=estimate_cov,
         kappa_x=kappa_x_terminal,
         kappa_u=kappa_u_terminal,
-        # (17) is asked of all times: those of the horizon, and the long run.
+        # (17) at all times: in the horizon and in the long run
         age_within_tau=min(1.0 - spec.link.outage(spec.tau + 1), *(age_cdf(mu, t, spec.tau) for t in range(len(mu)))),
         delta_tau=spec.delta_tau,
     )
@@ -254,11 +255,8 @@ def assembled(spec: DesignSpec, schedule: Schedule, terminal: Terminal, past: in
     return replace(design, design_id=digest(design))
 
 
-# A design as plain numbers.
-
-
 def design_record(design: Design) -> dict[str, object]:
-    """The design as plain numbers, for recordings and `uavctl design --json`."""
+    """Return the design as plain numbers, for recordings and `uavctl design --json`."""
     plant, schedule, terminal = design.plant, design.schedule, design.terminal
     return {
         "design_id": design.design_id,

@@ -1,8 +1,14 @@
 """The exact decision problem, component by component, in Clarabel.
 
-Problem (19) with its terminal condition reduced, state constraints softened by exact penalties, and an artificial
-reference: the plan ends in the equilibrium nearest to the target that can be reached. Where no equilibrium is within
-reach of N steps, a second program lets the terminal equality give way, and the answer says so.
+1. Problem (19) with a reduced terminal condition, state constraints softened by exact penalties, and an artificial
+   reference: the plan ends in the equilibrium nearest to the target that can be reached.
+2. Where N steps reach no equilibrium, a second program softens the terminal equality; the answer lists it as relaxed.
+3. `assemble` joins the answers of the components to the answer for the plant.
+4. `check_schedule` is the margin of the terminal condition; `optimal_cost` the cost of a state.
+5. Late positions (re-basing). A position that is newer than the plan's base but j steps old gives x̂(k|k-j), the
+   prediction under the inputs since then. A plan from there is a solve at the time of capture with those j inputs
+   fixed: the means start at x̂(k|k-j), the disturbances w(k-j) … w(k-1) are unknown, and the past stages are no
+   decision. The likelihoods are conditional: nothing newer than k-j has arrived until k.
 """
 
 from __future__ import annotations
@@ -18,25 +24,22 @@ from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite, relative_gap
 from uavctl.smpc.hahn_stursberg.cones import BREAKDOWN, Expression, ProgramBuilder, Solution
-from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, assembled
+from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, assemble_design
 from uavctl.smpc.hahn_stursberg.horizon import (
     Affine,
     Component,
     Horizon,
     TerminalBound,
     decompose,
-    horizon_of,
-    stack,
+    make_horizon,
+    stack_rows,
     terminal_bound,
 )
 from uavctl.smpc.hahn_stursberg.program import Program, terminal_backoff_x
-from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, fixed
+from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, make_fixed
 from uavctl.smpc.plant import digest
 
-# From the answers of independent components to the answer for the whole plant.
-
-
-# The worst of several components' endings is the plan's: the later in this list, the worse.
+# Status of a plan: the worst of its components, the later in this list.
 _ORDER = (
     SolveStatus.OPTIMAL,
     SolveStatus.INACCURATE,
@@ -48,7 +51,7 @@ _ORDER = (
 
 @dataclass(frozen=True, eq=False)
 class PartAnswer:
-    """A component's share of an answer, in its own coordinates and rows; the fields are those of `Answer`."""
+    """Answer of a component, in its coordinates and rows; the fields are those of `Answer`."""
 
     status: SolveStatus
     iterations: int
@@ -64,7 +67,7 @@ class PartAnswer:
 
     @classmethod
     def failed(cls, status: SolveStatus, iterations: int = 0) -> PartAnswer:
-        """A share without a plan."""
+        """Return an answer without a plan."""
         empty = np.zeros((0, 0))
         return cls(status, iterations, empty, empty, empty, np.zeros(0), np.inf, np.inf, np.inf, np.inf, -np.inf)
 
@@ -77,7 +80,7 @@ def assemble(
     parts: Sequence[tuple[Component, PartAnswer]],
     preview: Preview = NOMINAL,
 ) -> Answer:
-    """Answer for the whole plant from `x` (n_x,); without a plan if a component has none."""
+    """Assemble the answer for the plant from `x` (n_x,); without a plan if a component has none."""
     status = max((part.status for _, part in parts), key=_ORDER.index)
     iterations = sum(part.iterations for _, part in parts)
     if status not in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE):
@@ -109,41 +112,46 @@ def assemble(
         gap=relative_gap(cost, cost_lower),
         iterations=iterations,
     )
-    return told(design, answer, [component for component, _ in parts], preview)
+    return add_relaxed(design, answer, [component for component, _ in parts], preview)
 
 
-def told(design: Design, answer: Answer, components: Sequence[Component], preview: Preview) -> Answer:
-    """The answer with the names of what gave way, if anything did."""
+def add_relaxed(design: Design, answer: Answer, components: Sequence[Component], preview: Preview) -> Answer:
+    """Add the relaxed constraints to an answer, if there are any."""
     if max(answer.slack, answer.terminal_miss) <= KEPT_TOLERANCE and preview.limits is None:
         return answer
-    return replace(answer, relaxed=gave_way(design, answer, components, preview))
+    return replace(answer, relaxed=find_relaxed(design, answer, components, preview))
 
 
-def gave_way(design: Design, answer: Answer, components: Sequence[Component], preview: Preview) -> tuple[GaveWay, ...]:
-    """Constraints that an answer does not keep: tightened state rows, terminal rows, the terminal equality."""
+def find_relaxed(
+    design: Design, answer: Answer, components: Sequence[Component], preview: Preview
+) -> tuple[GaveWay, ...]:
+    """Return the relaxed constraints of an answer: tightened state rows, terminal rows, the terminal equality."""
     limits = preview.limits
     if limits is None:
         limits = np.tile(design.state_set.b, (design.horizon + 1, 1))
     free = design.horizon - design.terminal.tau
-    given: list[GaveWay] = []
+    relaxed: list[GaveWay] = []
 
     def add(constraint: str, stage: int, excess: Array) -> None:
         for i in np.flatnonzero(excess > KEPT_TOLERANCE):
-            given.append(GaveWay(constraint=constraint, stage=stage, index=int(i), amount=float(excess[i])))
+            relaxed.append(GaveWay(constraint=constraint, stage=stage, index=int(i), amount=float(excess[i])))
 
+    # C x̄_t + β_t - b_t,  C x_s + β_terminal - min_{t>=N} b_t,  |x̄_N - x_s|
     excess = answer.states @ design.state_set.c.T + answer.backoff_x - limits
     for t in range(1, design.horizon + 1):
         add("state", t, excess[t])
     backoff = np.zeros(design.state_set.b.size)
     for part in components:
         backoff[part.rows_x] = terminal_backoff_x(design, part)
-    placed = design.state_set.c @ answer.reference
-    add("terminal", free, placed + backoff - limits[free:].min(axis=0))
+    reference_values = design.state_set.c @ answer.reference
+    add("terminal", free, reference_values + backoff - limits[free:].min(axis=0))
     add("equilibrium", free, np.abs(answer.states[free] - answer.reference))
-    return tuple(given)
+    return tuple(relaxed)
 
 
 def _predict(design: Design, x: Array, inputs: Array) -> Array:
+    """Predict the mean states (H+1, n_x)."""
+    # x̄_{t+1} = A x̄_t + B u_t
     states = [x]
     for u in inputs:
         states.append(design.plant.a @ states[-1] + design.plant.b @ u)
@@ -152,10 +160,10 @@ def _predict(design: Design, x: Array, inputs: Array) -> Array:
 
 METHOD = "exact"
 
-# The solver ends when the gap is small beside its largest numbers; where prices dwarf the cost, that proves nothing.
-_PROVEN = 1e-4
+# Largest relative gap of an optimal answer. Clarabel's gap is relative to its largest numbers, which may be prices.
+_MAX_GAP = 1e-4
 
-# What each ending of the solver means for a flight; a test holds the table complete.
+# Clarabel's status as a `SolveStatus`; a test checks that the table is complete.
 _STATUS = {
     "Solved": SolveStatus.OPTIMAL,
     "AlmostSolved": SolveStatus.INACCURATE,
@@ -176,7 +184,7 @@ _STATUS = {
 class ConicSolver:
     """Solves the decision problem of a design; built once, then only right sides change.
 
-    The same question gives the same bits whatever was asked before. Not for concurrent use.
+    The same question gives the same bits after any other questions. Not for concurrent use.
     """
 
     def __init__(self, design: Design) -> None:
@@ -190,72 +198,72 @@ class ConicSolver:
         self._late: dict[int, ConicSolver] = {}
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
-        """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,), with what is known ahead.
+        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,), with a preview.
 
         Numbers that are not finite give an answer FAILED, as does a solver that breaks down; nothing is raised.
         """
         if not is_finite(x, target, preview) or preview.age > len(self._design.late):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         if preview.age:
-            return self._of_late(preview.age).solve(seq, x, target, replace(preview, age=0))
+            return self._find_late_solver(preview.age).solve(seq, x, target, replace(preview, age=0))
         parts = [(part.component, part.solve(x, target, preview)) for part in self._parts]
         return assemble(self._design, seq, METHOD, x, parts, preview)
 
-    def _of_late(self, late: int) -> ConicSolver:
-        """The solver of the design for positions `late` steps old; built when it is first asked for."""
+    def _find_late_solver(self, late: int) -> ConicSolver:
+        """Return the solver for positions `late` steps old; it is built at its first use."""
         if late not in self._late:
             self._late[late] = ConicSolver(self._design.late[late - 1])
         return self._late[late]
 
 
 class PartSolver:
-    """The two programs of one component, and how their solutions are read."""
+    """Solver of one component: the program with a hard terminal equality, then the soft one."""
 
     def __init__(self, design: Design, component: Component) -> None:
         self.component = component
         self.design = design
-        self.horizon = horizon_of(design, component)
-        self._exact = Program(design, self.horizon, soft_terminal=False)
-        self._missing = Program(design, self.horizon, soft_terminal=True)
-        self._unseen = np.einsum("ij,jk,ik->i", component.c_x, component.estimate_cov, component.c_x)
-        self._noise_x = stack([self.horizon.state_noise(t, component.c_x) for t in range(design.horizon + 1)])
-        self._noise_u = stack([self.horizon.input_noise(t, component.c_u) for t in range(design.horizon)])
+        self.horizon = make_horizon(design, component)
+        self._hard = Program(design, self.horizon, soft_terminal=False)
+        self._soft = Program(design, self.horizon, soft_terminal=True)
+        self._error_variance = np.einsum("ij,jk,ik->i", component.c_x, component.estimate_cov, component.c_x)
+        self._noise_x = stack_rows([self.horizon.state_noise(t, component.c_x) for t in range(design.horizon + 1)])
+        self._noise_u = stack_rows([self.horizon.input_noise(t, component.c_u) for t in range(design.horizon)])
 
     def solve(self, x: Array, target: Array, preview: Preview = NOMINAL) -> PartAnswer:
-        """Solve for the whole plant's state, target and preview."""
+        """Solve for the plant's state, target and preview."""
         x, target = x[self.component.states], target[self.component.states]
-        program = self._exact
+        program = self._hard
         solution = program.conic.solve(program.parameters(x, target, preview))
         status, iterations = _STATUS[solution.status], solution.iterations
         if status not in (SolveStatus.OPTIMAL, SolveStatus.ITERATION_LIMIT):
-            program = self._missing
+            program = self._soft
             solution = program.conic.solve(program.parameters(x, target, preview))
             status = _STATUS[solution.status]
             iterations += solution.iterations
         if not (np.all(np.isfinite(solution.variables)) and np.isfinite(solution.cost)):
             status = SolveStatus.FAILED
-        return self._read(program, solution, status, iterations, x, target)
+        return self._read_solution(program, solution, status, iterations, x, target)
 
     def backoffs(self, theta: Array) -> tuple[Array, Array]:
-        """Back-offs of the state rows (H+1, m_x) and of the input rows (H, m_u) under gains `theta`."""
-        # κ_t (‖noise_t(θ)‖² + cᵀ Cov c)^½
+        """Return the back-offs of the state rows (H+1, m_x) and of the input rows (H, m_u) under gains `theta`."""
+        # β_t = κ_t (‖noise_t(θ)‖² + c'Pc)^½, P the covariance of the estimate's error
         part, steps, width = self.component, self.horizon.steps, self.horizon.width
-        noise_x = self._noise_x.at(theta).reshape(steps + 1, part.b_x.size, width)
-        noise_u = self._noise_u.at(theta).reshape(steps, part.b_u.size, width)
-        backoff_x: Array = self.design.kappa_x[:, None] * np.sqrt((noise_x**2).sum(axis=2) + self._unseen)
+        noise_x = self._noise_x.evaluate(theta).reshape(steps + 1, part.b_x.size, width)
+        noise_u = self._noise_u.evaluate(theta).reshape(steps, part.b_u.size, width)
+        backoff_x: Array = self.design.kappa_x[:, None] * np.sqrt((noise_x**2).sum(axis=2) + self._error_variance)
         backoff_u: Array = self.design.kappa_u[:, None] * np.sqrt((noise_u**2).sum(axis=2))
         return backoff_x, backoff_u
 
-    def _read(
+    def _read_solution(
         self, program: Program, solution: Solution, status: SolveStatus, iterations: int, x: Array, target: Array
     ) -> PartAnswer:
         part, horizon, layout, values = self.component, self.horizon, program.layout, solution.variables
-        here = part.coordinates @ x
-        y = here + values[layout.y]
-        wanted = np.repeat((part.u_eq @ y)[None], horizon.steps, axis=0)
-        wanted[: horizon.free] = values[layout.v].reshape(horizon.free, -1) + part.u_eq @ here
-        inputs, kept = clip_inputs(wanted, part.c_u, part.b_u)
-        unproven = relative_gap(solution.cost, solution.cost_lower) > _PROVEN
+        y_now = part.coordinates @ x
+        y = y_now + values[layout.y]
+        unclipped = np.repeat((part.u_eq @ y)[None], horizon.steps, axis=0)
+        unclipped[: horizon.free] = values[layout.v].reshape(horizon.free, -1) + part.u_eq @ y_now
+        inputs, kept = clip_inputs(unclipped, part.c_u, part.b_u)
+        unproven = relative_gap(solution.cost, solution.cost_lower) > _MAX_GAP
         if (unproven or not kept) and status is SolveStatus.OPTIMAL:
             status = SolveStatus.INACCURATE
         backoff_x, backoff_u = self.backoffs(values[layout.theta])
@@ -266,30 +274,27 @@ class PartSolver:
             backoff_x=backoff_x,
             backoff_u=backoff_u,
             reference=part.x_eq @ y,
-            slack=_total(values[layout.slack]),
+            slack=_sum_positive(values[layout.slack]),
             offset=float(np.sum(np.abs(y - part.coordinates @ target))),
-            terminal_miss=_total(values[layout.miss]) + _total(values[layout.outside]),
+            terminal_miss=_sum_positive(values[layout.miss]) + _sum_positive(values[layout.outside]),
             cost=solution.cost,
             cost_lower=solution.cost_lower,
         )
 
 
-def _total(values: Array) -> float:
+def _sum_positive(values: Array) -> float:
     return float(np.sum(np.maximum(values, 0.0)))
 
 
-# Offline questions about a design: can its schedule meet the terminal condition, and at what cost is a state left?
-
-
-# Below this margin the terminal condition has no usable interior as it stands, and is reduced once more.
-LEAST_MARGIN = 1e-6
+# Below this margin the terminal condition has no usable interior, and constant directions are removed.
+MIN_MARGIN = 1e-6
 
 
 def check_schedule(design: Design) -> float:
-    """Margin s* of the terminal condition: max s with I - L_z⁻¹ Cov(z) L_z⁻ᵀ ⪰ s I over all gains of the schedule.
+    """Return the margin s* of the terminal condition: max s with I - L_z⁻¹ Cov(z) L_z⁻ᵀ ⪰ s I over all gains.
 
-    Where that leaves no interior (s* <= 1e-6), constant directions are taken out and s* is that of the reduced
-    condition, which is the one that the solver sees.
+    Without an interior (s* <= 1e-6), constant directions are removed, and s* is that of the reduced condition, which is
+    the solver's.
 
     Returns:
         s*, the least of all components.
@@ -297,14 +302,14 @@ def check_schedule(design: Design) -> float:
     Raises:
         DesignError: s* < 0: the schedule feeds back later than the terminal law does.
     """
-    return min(_component_margin(horizon_of(design, component)) for component in decompose(design))
+    return min(_component_margin(make_horizon(design, component)) for component in decompose(design))
 
 
 def _component_margin(horizon: Horizon) -> float:
     margin = _margin(terminal_bound(horizon, move_constants=False))
-    if margin <= LEAST_MARGIN:
+    if margin <= MIN_MARGIN:
         margin = _margin(terminal_bound(horizon))
-    if margin <= LEAST_MARGIN:
+    if margin <= MIN_MARGIN:
         raise DesignError(
             "schedule.delays",
             f"the schedule is slower than the terminal law (s* = {margin:.2g}): no feedback keeps the terminal "
@@ -315,9 +320,9 @@ def _component_margin(horizon: Horizon) -> float:
 
 
 def _margin(bound: TerminalBound) -> float:
-    """Max s with (1 - s) I ⪰ Y Yᵀ and `fixed` = 0; -inf where no gain meets the equalities."""
-    if bound.least < -LEAST_MARGIN:
-        return bound.least
+    """Return max s with (1 - s) I ⪰ Y Y' and `fixed` = 0; -inf where no gain meets the equalities."""
+    if bound.least_eigenvalue < -MIN_MARGIN:
+        return bound.least_eigenvalue
     n_theta = bound.y.matrix.shape[1]
     if not n_theta:
         largest = np.linalg.norm(bound.y.offset.reshape(bound.rows, bound.columns), 2) if bound.y.offset.size else 0.0
@@ -336,7 +341,7 @@ def _margin(bound: TerminalBound) -> float:
 
 
 def _expression(affine: Affine) -> Expression:
-    """The map of θ as one of (θ, s)."""
+    """Return the map of θ as a map of (θ, s)."""
     size = affine.offset.size
     return Expression(
         np.hstack([affine.matrix.toarray(), np.zeros((size, 1))]), np.zeros((size, 0)), affine.offset.astype(np.float64)
@@ -344,10 +349,10 @@ def _expression(affine: Affine) -> Expression:
 
 
 @lru_cache(maxsize=1)
-def _solver(design: Design) -> ConicSolver | None:
-    """The last design's solver, None where its schedule will not do.
+def _find_solver(design: Design) -> ConicSolver | None:
+    """Return the solver of the last design, None if its schedule is infeasible.
 
-    A search asks for the cost of many states of one design in a row; margin and programs are the design's alone.
+    A search asks for the costs of many states of one design in a row; margin and programs depend on the design alone.
     """
     try:
         check_schedule(design)
@@ -357,8 +362,8 @@ def _solver(design: Design) -> ConicSolver | None:
 
 
 def optimal_cost(design: Design, x: Array) -> float | None:
-    """Optimal cost (19a) from a state (n_x,) to the design's target, None where (19) is infeasible."""
-    solver = _solver(design)
+    """Return the optimal cost (19a) from a state (n_x,) to the design's target, None where (19) is infeasible."""
+    solver = _find_solver(design)
     if solver is None:
         return None
     answer = solver.solve(0, x, design.target)
@@ -367,67 +372,59 @@ def optimal_cost(design: Design, x: Array) -> float | None:
     return None if max(answer.slack, answer.offset, answer.terminal_miss) > KEPT_TOLERANCE else answer.cost
 
 
-# Plans that are based on late positions (re-basing).
-#
-# A position that is newer than the plan's base but j steps old gives x̂(k|k-j), the prediction under the inputs that
-# were flown. Planning from there is solving at the time of capture with those j inputs held fixed: the means start at
-# x̂(k|k-j), the disturbances w(k-j) … w(k-1) are not known yet but will be, and the sunk stages are nobody's to
-# choose. What feedback may be counted on is conditional on what is known: nothing newer than k-j has come until k.
-
-
 @dataclass(frozen=True, eq=False)
 class LateDemand(ScheduleDemand):
-    """Requirements on a schedule that is based on a position `late` steps old; stages count from now."""
+    """Requirements on a schedule for a position `late` steps old; stages count from now."""
 
     late: int = 0
 
     def alpha(self, t: int, delay: int) -> float:
-        """P(w(k+t-d) is known at stage t | a(k) = late); 1 where that is not a disturbance since the base."""
+        """Return P(w(k+t-d) is known at stage t | a(k) = late); 1 for disturbances before the base."""
         newest = t - delay + self.late
         return 1.0 if newest < 0 else self.link.availability(t + self.late, newest, self.late)
 
-    def usable(self, delays: Sequence[int]) -> Array:
+    def joint_usability(self, delays: Sequence[int]) -> Array:
         """See `ScheduleDemand`."""
         if self.joint:
-            sunk = range(1, self.late + 1)  # longer than the time since the base: no feedback
-            return self.link.joint_availability((*sunk, *(delays)), self.late)[self.late :]
-        return super().usable(delays)
+            past_delays = range(1, self.late + 1)  # longer than the time since the base: no feedback
+            return self.link.joint_availability((*past_delays, *(delays)), self.late)[self.late :]
+        return super().joint_usability(delays)
 
 
-def with_late(design: Design, spec: DesignSpec, steps: int) -> Design:
-    """The design, with those for positions 1 … `steps` steps old.
+def add_late_designs(design: Design, spec: DesignSpec, steps: int) -> Design:
+    """Return the design with designs for positions 1 … `steps` steps old.
 
     Raises:
         DesignError: There is none for one of these ages.
     """
     if not steps:
         return design
-    late = tuple(make_late(design, spec, j) for j in range(1, steps + 1))
-    whole = replace(design, late=late, design_id="")
-    return replace(whole, design_id=digest(whole))
+    late = tuple(make_late_design(design, spec, j) for j in range(1, steps + 1))
+    extended = replace(design, late=late, design_id="")
+    return replace(extended, design_id=digest(extended))
 
 
-def make_late(design: Design, spec: DesignSpec, late: int) -> Design:
-    """The design for positions that are `late` steps old, with `late` = 0 the design itself.
+def make_late_design(design: Design, spec: DesignSpec, late: int) -> Design:
+    """Make the design for positions `late` steps old; with `late` = 0 it is the design itself.
 
-    It has the delays of the design. A stage t < d_t, which feeds back nothing there, does so here too: news of the
-    disturbances before now could reach it, but too seldom to count on.
+    It has the delays of the design. A stage t < d_t feeds back nothing here too: disturbances before now may become
+    known in time, but too rarely.
 
     Args:
-        design: For positions that are not late.
+        design: Design for positions that are not late.
         late: Age of the position, j [steps].
 
     Raises:
-        DesignError: The link leaves too little to count on, a terminal limit does not hold, or the terminal condition
-            cannot be met; the message names the age.
+        DesignError: Likelihoods are out of reach, a terminal limit does not hold, or the terminal condition cannot be
+            met; the message names the age.
     """
     if not late:
         return design
     demand = LateDemand(spec.link, spec.horizon, spec.tau, spec.delta_x, spec.delta_u, spec.joint, late)
     delays = tuple(d if t >= d else t + late + 1 for t, d in enumerate(design.schedule.delays))
     try:
-        made = assembled(spec, fixed(demand, delays), design.terminal, late)
-        check_schedule(made)
+        late_design = assemble_design(spec, make_fixed(demand, delays), design.terminal, late)
+        check_schedule(late_design)
     except DesignError as error:
         raise DesignError(error.key, f"for positions of age {late}: {error.reason}", error.hint) from error
-    return made
+    return late_design

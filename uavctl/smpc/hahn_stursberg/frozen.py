@@ -1,12 +1,12 @@
 """Decisions by the exact program, and by a frozen policy where its KKT conditions prove that it gives the same.
 
-1. The frozen policy's back-offs do not depend on the question, so the mean alone is left: a small QP. Rows of which the
-   policy takes the whole room are pinned to the middle between their limits.
-2. The joint problem's KKT conditions hold if the pinned QP has an optimum, the multipliers of the pinned rows stay
-   within those of the policy, and no other row that the gains move has a multiplier (theory notes, D). A row with slack
-   has its price for a multiplier: such an answer is refused too.
-3. An accepted answer still brings its proof: the Lagrangian's value at its multipliers is a lower bound of the optimum.
-4. All other questions go to the exact program, axis by axis.
+1. The frozen policy's back-offs do not depend on the question, so a small QP of the mean remains. Rows whose whole room
+   the policy takes are pinned to the middle between their limits.
+2. The joint problem's KKT conditions hold if the pinned QP has an optimum, the multipliers of the pinned rows are at
+   most those of the policy, and no other gain row has a multiplier (theory notes, D). A row with slack has its price as
+   multiplier: such an answer is refused too.
+3. An accepted answer has a proof: the Lagrangian's value at its multipliers is a lower bound of the optimum.
+4. All other questions go to the exact program, component by component.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from uavctl.smpc.batch import Decisions
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, PartAnswer, PartSolver, assemble
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
-from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind, by_rows, dot_rows
+from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind, dot_rows, multiply_rows
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.qp import EQUAL, SOFT, QuadraticProgram
 
-FROZEN = "frozen"  # the method of an answer that no component needed the exact program for
+FROZEN = "frozen"  # method of an answer without an exact program
 
-# A multiplier below this share of a typical cost counts as zero.
-_ZERO = 1e-11
+# A multiplier below this share of a typical cost counts as 0.
+_ZERO_SHARE = 1e-11
 
-# Beyond, squares of numbers that follow from a question's may overflow.
-_ABSURD = 1e150
+# Squares of larger numbers, and of what follows from them, may overflow.
+_MAX_NUMBER = 1e150
 
 # Largest relative gap of an accepted answer: the exact program's own tolerance.
-_PROVEN = 1e-7
+_MAX_GAP = 1e-7
 
 
 class Shortcut:
-    """The frozen policy of one component, ready to be asked."""
+    """Solver with the frozen policy of one component."""
 
     def __init__(self, problem: MeanProblem, policy: Policy, backoff_x: Array, backoff_u: Array) -> None:
         """Prepare the pinned QP.
@@ -53,14 +53,14 @@ class Shortcut:
         """
         self._problem, self._covariance = problem, policy.cost
         self._backoff_x, self._backoff_u = backoff_x, backoff_u
-        backoff_x.flags.writeable = backoff_u.flags.writeable = False  # every answer has these
+        backoff_x.flags.writeable = backoff_u.flags.writeable = False  # shared by all answers
         kinds = np.array([row.kind for row in problem.rows])
-        soft, links = np.isfinite(problem.price), problem.links
+        soft, gain_rows = np.isfinite(problem.price), problem.gain_rows
         slope = np.zeros(soft.size)
-        slope[links] = policy.slope
+        slope[gain_rows] = policy.slope
         self._pins = np.flatnonzero(slope > 0.0)
         self._backoff = problem.backoff.copy()
-        self._backoff[links] = policy.backoff
+        self._backoff[gain_rows] = policy.backoff
         self._largest = _largest_multipliers(problem, policy, slope, kinds)
         offset = kinds == RowKind.OFFSET
         self._offset, self._price = np.flatnonzero(offset), problem.price[offset]
@@ -75,33 +75,38 @@ class Shortcut:
         self._level = policy.level - float(slope[self._pins] @ half_room)
 
     def solve(self, x: Array, target: Array, preview: Preview) -> list[PartAnswer | None]:
-        """Answers for states (M, n_x) of the whole plant, with one target (n_x,) and preview.
+        """Solve for states (M, n_x) of the whole plant, with one target (n_x,) and preview.
 
         None where the policy is not proven optimal.
         """
         problem, part = self._problem, self._problem.horizon.component
-        ask = problem.question(x[:, part.states], target[part.states], preview)
-        above, below = ask.upper - ask.offset - self._backoff, ask.lower - ask.offset + self._backoff
+        qp = problem.question(x[:, part.states], target[part.states], preview)
+        above, below = (qp.upper - qp.offset - self._backoff, qp.lower - qp.offset + self._backoff)
         above[:, self._pins] = below[:, self._pins] = 0.5 * (above + below)[:, self._pins]
-        q, net = np.full_like(ask.f, np.nan), np.full_like(ask.offset, np.nan)  # NaN where there is no optimum
-        for i, sides in enumerate(zip(ask.f, above, below, strict=True)):
+        q, net = (np.full_like(qp.f, np.nan), np.full_like(qp.offset, np.nan))  # NaN where there is no optimum
+        for i, sides in enumerate(zip(qp.f, above, below, strict=True)):
             solved = self._program.solve(*sides)
             if solved is not None:
                 q[i], net[i] = solved
         net = np.clip(net, -self._clip, self._clip)
-        # cost = c + J_cov + ½ qᵀHq + fᵀq + price · |offset|
-        off_target = np.abs(by_rows(q, problem.a[self._offset].T) + ask.offset[:, self._offset])
-        cost = ask.constant + self._covariance + dot_rows(q, by_rows(0.5 * q, problem.h) + ask.f)
+        # cost = c + J_cov + ½ q'Hq + f'q + price · |offset|
+        off_target = np.abs(multiply_rows(q, problem.a[self._offset].T) + qp.offset[:, self._offset])
+        cost = qp.constant + self._covariance + dot_rows(q, multiply_rows(0.5 * q, problem.h) + qp.f)
         cost += dot_rows(off_target, self._price)
-        # lower = c + D - μ · room/2 - ½ gᵀH⁻¹g - λ⁺ · above + λ⁻ · below, with g = f + Aᵀ(λ⁺ - λ⁻)
-        g, plus = ask.f + by_rows(net, problem.a), np.maximum(net, 0.0)
-        bound = 0.5 * dot_rows(by_rows(g, self._h_inverse), g) + dot_rows(plus, above) + dot_rows(net - plus, below)
-        cost_lower = ask.constant + self._level - bound
-        w, here = by_rows(q, problem.z.T) + by_rows(ask.p, problem.w.T), ask.p[:, problem.n_p - problem.n_y :]
-        inputs = problem.inputs(w, here)
+        # lower = c + D - μ · room/2 - ½ g'H⁻¹g - λ⁺ · above + λ⁻ · below, with g = f + A'(λ⁺ - λ⁻)
+        g, plus = qp.f + multiply_rows(net, problem.a), np.maximum(net, 0.0)
+        bound = (
+            0.5 * dot_rows(multiply_rows(g, self._h_inverse), g) + dot_rows(plus, above) + dot_rows(net - plus, below)
+        )
+        cost_lower = qp.constant + self._level - bound
+        w, y_now = (
+            multiply_rows(q, problem.z.T) + multiply_rows(qp.p, problem.w.T),
+            qp.p[:, problem.n_p - problem.n_y :],
+        )
+        inputs = problem.inputs(w, y_now)
         inputs = clip_inputs(inputs.reshape(-1, inputs.shape[2]), part.c_u, part.b_u)[0].reshape(inputs.shape)
-        reference = by_rows(w[:, problem.n_v :] + here, part.x_eq.T)
-        fits: NDArray[np.bool_] = np.all(np.abs(net) <= self._largest, axis=1)
+        reference = multiply_rows(w[:, problem.n_v :] + y_now, part.x_eq.T)
+        is_optimal: NDArray[np.bool_] = np.all(np.abs(net) <= self._largest, axis=1)
         return [
             PartAnswer(
                 status=SolveStatus.OPTIMAL,
@@ -116,42 +121,42 @@ class Shortcut:
                 cost=float(cost[i]),
                 cost_lower=float(cost_lower[i]),
             )
-            if fits[i] and relative_gap(cost[i], cost_lower[i]) <= _PROVEN
+            if is_optimal[i] and relative_gap(cost[i], cost_lower[i]) <= _MAX_GAP
             else None
             for i in range(len(x))
         ]
 
 
-def _answerable(x: Array, target: Array, preview: Preview) -> NDArray[np.bool_]:
-    """Which questions (M,) are finite, and small enough for their squares to be."""
-    given = [target] if preview.limits is None else [target, preview.limits]
+def _is_answerable(x: Array, target: Array, preview: Preview) -> NDArray[np.bool_]:
+    """Return which questions (M,) are finite, with squares that do not overflow."""
+    arrays = [target] if preview.limits is None else [target, preview.limits]
     if preview.path is not None:
-        given += [preview.path.states, preview.path.inputs]
-    common = all(bool((np.abs(values) < _ABSURD).all()) for values in given)
-    which: NDArray[np.bool_] = np.all(np.abs(x) < _ABSURD, axis=1)
-    return which & common
+        arrays += [preview.path.states, preview.path.inputs]
+    common = all(bool((np.abs(values) < _MAX_NUMBER).all()) for values in arrays)
+    is_small: NDArray[np.bool_] = np.all(np.abs(x) < _MAX_NUMBER, axis=1)
+    return is_small & common
 
 
 def _largest_multipliers(problem: MeanProblem, policy: Policy, slope: Array, kinds: Array) -> Array:
-    """Largest multiplier of each row (m,) that an accepted answer may have."""
-    soft, links, pinned = np.isfinite(problem.price), problem.links, slope > 0.0
+    """Return the largest multiplier of each row (m,) in an accepted answer."""
+    soft, gain_rows, pinned = np.isfinite(problem.price), problem.gain_rows, slope > 0.0
     # A multiplier at a state row's price means slack.
     largest = np.where(kinds == RowKind.STATE, problem.price * (1.0 - 1e-9), np.inf)
-    largest[links] = _ZERO * policy.cost
-    # A soft row that is pinned would not be left at its price: such a policy answers nothing.
+    largest[gain_rows] = _ZERO_SHARE * policy.cost
+    # The price of a pinned soft row is no bound: such a policy gives no answers.
     largest[pinned] = np.where(soft, -1.0, slope)[pinned]
     return largest
 
 
-class Share(NamedTuple):
-    """A component's share of an answer."""
+class MethodAnswer(NamedTuple):
+    """Answer of a component and its method."""
 
-    method: str  # FROZEN, or that of the exact program
+    method: str  # FROZEN, or the exact program's
     answer: PartAnswer
 
 
-class _Part:
-    """Both ways to solve one component."""
+class _ComponentSolver:
+    """Solver of one component: frozen policy first, then the exact program."""
 
     def __init__(self, design: Design, component: Component) -> None:
         self.exact = PartSolver(design, component)
@@ -160,22 +165,24 @@ class _Part:
         # None where there is no frozen policy
         self._shortcut = None if policy is None else Shortcut(problem, policy, *self.exact.backoffs(policy.theta))
 
-    def solve(self, x: Array, target: Array, preview: Preview) -> list[Share]:
-        """Shares of the answers from the whole plant's states (M, n_x)."""
+    def solve(self, x: Array, target: Array, preview: Preview) -> list[MethodAnswer]:
+        """Solve for states (M, n_x) of the whole plant."""
         if not len(x):
             return []
-        frozen = [None] * len(x) if self._shortcut is None else self._shortcut.solve(x, target, preview)
+        answers = [None] * len(x) if self._shortcut is None else self._shortcut.solve(x, target, preview)
         return [
-            Share(METHOD, self.exact.solve(state, target, preview)) if answer is None else Share(FROZEN, answer)
-            for state, answer in zip(x, frozen, strict=True)
+            MethodAnswer(METHOD, self.exact.solve(state, target, preview))
+            if answer is None
+            else MethodAnswer(FROZEN, answer)
+            for state, answer in zip(x, answers, strict=True)
         ]
 
 
 class ShortcutSolver:
     """Solves the decision problem of a design exactly: by frozen policies where these are optimal, else in Clarabel.
 
-    All programs are built at first, those for late positions too: no decision waits for one.
-    The same question gives the same bits whatever was asked before. Not for concurrent use.
+    All programs are built at the start, those for late positions too: no decision waits for one.
+    The same question gives the same bits after any other questions. Not for concurrent use.
     """
 
     def __init__(self, design: Design) -> None:
@@ -185,60 +192,62 @@ class ShortcutSolver:
             DesignError: The design cannot be decomposed, or its schedule does not fit its terminal law.
         """
         self._variants = tuple(
-            (variant, tuple(_Part(variant, component) for component in decompose(variant)))
+            (variant, tuple(_ComponentSolver(variant, component) for component in decompose(variant)))
             for variant in (design, *design.late)
         )
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
-        """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,), with what is known ahead.
+        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,), with a preview.
 
-        Numbers that are not finite, or absurdly large, give an answer FAILED, as does a solver that breaks down;
-        nothing is raised.
+        Numbers that are not finite or extremely large give an answer FAILED, as does a solver that breaks down; nothing
+        is raised.
         """
-        design, shares = self.shares(x[None], target, preview)
+        design, shares = self.solve_components(x[None], target, preview)
         method = FROZEN if all(share.method == FROZEN for _, (share,) in shares) else METHOD
         return assemble(design, seq, method, x, [(part, share.answer) for part, (share,) in shares], preview)
 
-    def shares(self, x: Array, target: Array, preview: Preview) -> tuple[Design, list[tuple[Component, list[Share]]]]:
-        """Each component's shares of the answers from states (M, n_x), with the design that they are made by."""
-        known = preview.age < len(self._variants)
-        design, parts = self._variants[preview.age if known else 0]
-        asked = _answerable(x, target, preview) & known
+    def solve_components(
+        self, x: Array, target: Array, preview: Preview
+    ) -> tuple[Design, list[tuple[Component, list[MethodAnswer]]]]:
+        """Return the answers of each component from states (M, n_x), with their design."""
+        is_known = preview.age < len(self._variants)
+        design, parts = self._variants[preview.age if is_known else 0]
+        answerable = _is_answerable(x, target, preview) & is_known
         shares = []
         for part in parts:
-            found = iter(part.solve(x[asked], target, preview))
-            failed = Share(METHOD, PartAnswer.failed(SolveStatus.FAILED))
-            shares.append((part.exact.component, [next(found) if one else failed for one in asked]))
+            answers = iter(part.solve(x[answerable], target, preview))
+            failed = MethodAnswer(METHOD, PartAnswer.failed(SolveStatus.FAILED))
+            shares.append((part.exact.component, [next(answers) if is_asked else failed for is_asked in answerable]))
         return design, shares
 
 
 class ShortcutDecider:
     """Decisions of many runs towards one target; equal states are solved once. Implements `uavctl.smpc.batch.Decider`.
 
-    They are those of the solver, without what only a flight needs of them.
+    They are the solver's, without data that only a flight needs.
     """
 
     def __init__(self, solver: ShortcutSolver, target: Array) -> None:
         self._solver, self._target = solver, target
 
-    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
+    def decide(self, x: Array, age: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`."""
-        states, which = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
-        design, shares = self._solver.shares(states, self._target, Preview(age=late))
+        states, index = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
+        design, shares = self._solver.solve_components(states, self._target, Preview(age=age))
         solved = np.ones(len(states), dtype=np.bool_)
         inputs = np.zeros((len(states), design.horizon, design.plant.n_u))
         slack, cost, cost_lower = np.zeros((3, len(states)))
-        for part, of_part in shares:
-            answers = [share.answer for share in of_part]
-            found = np.array([answer.status is SolveStatus.OPTIMAL for answer in answers], dtype=np.bool_)
-            for i in np.flatnonzero(found):
+        for part, part_answers in shares:
+            answers = [share.answer for share in part_answers]
+            optimal = np.array([answer.status is SolveStatus.OPTIMAL for answer in answers], dtype=np.bool_)
+            for i in np.flatnonzero(optimal):
                 inputs[i][:, part.inputs] = answers[i].inputs
-            solved &= found
+            solved &= optimal
             slack += [answer.slack for answer in answers]
             cost += [answer.cost for answer in answers]
             cost_lower += [answer.cost_lower for answer in answers]
         inputs[~solved], cost[~solved], cost_lower[~solved] = 0.0, np.inf, -np.inf
         gap = np.full(len(states), np.inf)
         gap[solved] = list(map(relative_gap, cost[solved], cost_lower[solved]))
-        which = which.reshape(-1)
-        return Decisions(solved[which], inputs[which], slack[which], cost[which], gap[which])
+        index = index.reshape(-1)
+        return Decisions(solved[index], inputs[index], slack[index], cost[index], gap[index])

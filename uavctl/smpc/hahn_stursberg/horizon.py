@@ -1,15 +1,20 @@
-"""Stacked prediction of one component: means, disturbance feedback, covariance cost.
+"""Stacked prediction of one component: decomposition, means, disturbance feedback, covariance cost, terminal bound.
 
-x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The mean inputs v_t are free for t < N = H - τ and
-rest at the equilibrium u_s = u_eq y from there on, because x̄_N … x̄_H = x_s asks for nothing else. θ holds the entries
-of the gains M_{t,r} that the schedule admits: r <= t - d_t and r < N.
-
-Disturbances that the state does not show apart, as under an E or a W without full column rank, are not fed back apart
-either: M_{t,r} = Θ_{t,r} T with T w the part of w that E w determines, in units of its standard deviation. Feedback of
-the rest would only add variance. Where nothing is redundant T = I, and θ are entries of M.
-
-A plan that is based on a position `past` steps old counts the disturbances since then too, r = -past … -1: the mean
-starts at the prediction x̂(k) under the inputs that were flown, and what acted on it meanwhile is not known yet.
+1. Decomposition. Nodes are states, inputs and disturbances; an edge is a non-zero entry of A, B, E, W, Q_x, Q_u, K or
+   of one row of a constraint that couples two of them. The connected components are independent problems with the same
+   optimum, because gains across components only add cost and covariance. The χ² quantiles stay those of the plant.
+2. Prediction: x_t = Φ_t x + Γ_t v + Γ^eq_t y + Σ_r D_{t,r}(θ) ω_r with ω ~ N(0, I). The mean inputs v_t are free for
+   t < N = H - τ. From N on they are u_s = u_eq y, because x̄_N … x̄_H = x_s allows nothing else. θ holds the entries of
+   the gains M_{t,r} that the schedule admits: r <= t - d_t and r < N.
+3. Disturbances that the state cannot tell apart (E or W without full column rank) are fed back together:
+   M_{t,r} = Θ_{t,r} T, with T w the part of w that E w determines, in units of its standard deviation. Feedback of the
+   rest would only add variance. Without redundancy T = I, and θ are entries of M.
+4. A plan based on a position `past` steps old counts the disturbances since then too, r = -past … -1: the mean starts
+   at the prediction x̂(k) under the inputs since then, and these disturbances are unknown.
+5. Terminal bound: (19c), Σ_ξ - Ξ_H ⪰ 0, has an empty interior. The last τ disturbances are equal on both sides, so it
+   is Cov(z) ⪯ Σ_z for z = (x_N, u_N … u_{H-1}) and the N older disturbances. Columns of z without gains are constant
+   and move to the right side, R = Σ_z - Z_c Z_c'. On the range of R, whitened, it is ‖Y(θ)‖₂ <= 1; off that range z
+   must not move: linear equalities.
 """
 
 from __future__ import annotations
@@ -28,24 +33,17 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.schedule import Schedule
 from uavctl.smpc.sets import RANK_TOLERANCE, equilibrate, find_equilibria
 
-# Decomposition of the decision problem into independent parts.
-#
-# Nodes are states, inputs and disturbances; an edge is a non-zero entry by which A, B, E, W, Q_x, Q_u, K or one row
-# of a constraint couples two of them. The connected components are problems of their own with the same optimum:
-# gains across components only add cost and covariance. The χ² quantiles stay those of the whole plant.
-
-
 Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """One independent part of a design: where it sits in the whole, and its own matrices."""
+    """One independent part of a design: its indices in the plant, and its matrices."""
 
     states: Index  # indices of its states in the plant's
     inputs: Index  # indices of its inputs
     disturbances: Index  # indices of its disturbances
-    coordinates: Array  # (n_y, n_x): y of the equilibrium that a state belongs to, its positions where they can be held
+    coordinates: Array  # (n_y, n_x): y of the equilibrium of a state; its positions where they can be held
     rows_x: Index  # indices of its rows in the state set
     rows_u: Index  # indices of its rows in the input set
     a: Array  # A (n_x, n_x); b: B (n_x, n_u); e: E (n_x, n_w); w: W (n_w, n_w)
@@ -70,7 +68,7 @@ class Component:
 
 
 def decompose(design: Design) -> tuple[Component, ...]:
-    """Connected components of a design, in the order of their first state.
+    """Return the connected components of a design, in the order of their first state.
 
     Raises:
         DesignError: A state is connected to no input.
@@ -101,14 +99,14 @@ def decompose(design: Design) -> tuple[Component, ...]:
     )
 
 
-def whole(design: Design) -> Component:
-    """The design as one component, whatever it decomposes into."""
+def make_whole_component(design: Design) -> Component:
+    """Return the design as one component."""
     plant = design.plant
     return _component(design, np.arange(plant.n_x), np.arange(plant.n_u), np.arange(plant.n_w))
 
 
 def _shared_row(c: Array) -> Array:
-    """Non-zero where two variables appear in one row of a constraint."""
+    """Return a matrix that is non-zero where two variables share a row of a constraint."""
     used = (c != 0).astype(np.float64)
     shared: Array = used.T @ used
     return shared
@@ -120,16 +118,16 @@ def _component(design: Design, states: Index, inputs: Index, disturbances: Index
         raise DesignError("plant.b", f"states {states.tolist()} are reached by no input", "give each state an input")
     rows_x = _finite_rows(design.state_set.c[:, states], design.state_set.b)
     rows_u = _finite_rows(design.input_set.c[:, inputs], design.input_set.b)
-    stack = np.concatenate([i * plant.n_x + states for i in range(terminal.tau + 1)])
+    xi = np.concatenate([i * plant.n_x + states for i in range(terminal.tau + 1)])
     z = np.concatenate([states, *(plant.n_x + i * plant.n_u + inputs for i in range(terminal.tau))])
     a, b = plant.a[np.ix_(states, states)], plant.b[np.ix_(states, inputs)]
     q_x, q_u = design.q_x[np.ix_(states, states)], design.q_u[np.ix_(inputs, inputs)]
-    rest = find_equilibria(a, b, q_x, q_u, np.flatnonzero(np.isin(states, plant.position_index)))
+    equilibria = find_equilibria(a, b, q_x, q_u, np.flatnonzero(np.isin(states, plant.position_index)))
     return Component(
         states=states,
         inputs=inputs,
         disturbances=disturbances,
-        coordinates=rest.coordinates,
+        coordinates=equilibria.coordinates,
         rows_x=rows_x,
         rows_u=rows_u,
         a=a,
@@ -145,12 +143,12 @@ def _component(design: Design, states: Index, inputs: Index, disturbances: Index
         k=terminal.k[np.ix_(inputs, states)],
         sigma_x=terminal.sigma_x[np.ix_(states, states)],
         estimate_cov=design.estimate_cov[np.ix_(states, states)],
-        sigma_xi=terminal.sigma_xi[np.ix_(stack, stack)],
+        sigma_xi=terminal.sigma_xi[np.ix_(xi, xi)],
         sigma_z=terminal.sigma_z[np.ix_(z, z)],
-        p_xi=terminal.p_xi[np.ix_(stack, stack)],
-        held=rest.held,
-        x_eq=rest.x_eq,
-        u_eq=rest.u_eq,
+        p_xi=terminal.p_xi[np.ix_(xi, xi)],
+        held=equilibria.held,
+        x_eq=equilibria.x_eq,
+        u_eq=equilibria.u_eq,
     )
 
 
@@ -160,13 +158,13 @@ def _finite_rows(c: Array, b: Array) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """offset + matrix θ, a vector (m,) affine in θ."""
+    """Vector offset + matrix θ (m,), affine in θ."""
 
     offset: Array
     matrix: sparse.csr_array
 
-    def at(self, theta: Array) -> Array:
-        """Value (m,) at θ."""
+    def evaluate(self, theta: Array) -> Array:
+        """Return the value (m,) at θ."""
         value: Array = self.offset + self.matrix @ theta
         return value
 
@@ -187,8 +185,7 @@ class Horizon:
         """Predict `component` over `steps` steps from a position that is `past` steps old.
 
         Raises:
-            DesignError: The schedule feeds back a disturbance r >= N, for which the reduced terminal condition does
-                not hold.
+            DesignError: The schedule feeds back a disturbance r >= N; the reduced terminal condition excludes that.
         """
         self.component = component
         self.steps = steps  # H
@@ -196,28 +193,29 @@ class Horizon:
         self.free = steps - tau  # N = H - τ, the number of stages with a free mean input
         self.past = past  # disturbances before k that are not known at k [steps]
         n_u = component.b.shape[1]
-        self._spread, self.feedback, self._root_w = _shown(component.e, component.w)
-        self._n_w = self._spread.shape[1]
-        fed_back = np.flatnonzero(np.any(self._root_w != 0.0, axis=1)).tolist()  # nothing to feed back otherwise
-        # Rows (n_b, n_u) that show what of an input the state feels: the identity where B has full column rank
-        self.drive = _felt(component.b)
-        # Stages whose input limits are not implied by the terminal condition: N, but H where B lacks full column
-        # rank, because (19c) then says nothing about what the state does not feel
+        self._noise_root, self.feedback, self._root_w = _factor_feedback(component.e, component.w)
+        self._n_w = self._noise_root.shape[1]
+        fed_back = np.flatnonzero(np.any(self._root_w != 0.0, axis=1)).tolist()  # rows with something to feed back
+        # Rows (n_b, n_u) of inputs that act on the state: the identity where B has full column rank
+        self.drive = _select_input_rows(component.b)
+        # Stages whose input limits the terminal condition does not imply: N, or H where B lacks full column rank,
+        # because (19c) does not restrict inputs without effect
         self.input_stages = self.free if len(self.drive) == n_u else steps
         # (t, r, input, row of `feedback`) of each entry of θ
         self.gains = tuple(
             (t, r, i, j)
             for t in range(steps)
-            for r in _fed_back(t, int(schedule.delays[t]), self.free, past)
+            for r in _find_feedback_range(t, int(schedule.delays[t]), self.free, past)
             for i in range(n_u)
             for j in fed_back
         )
+        # Φ_t = A^t
         powers = [np.eye(component.a.shape[0])]
         for _ in range(steps + past):
             powers.append(component.a @ powers[-1])
         self.phi = np.array(powers[: steps + 1])  # Φ_t (H+1, n_x, n_x)
         self._response = np.array([power @ component.b for power in powers[:-1]])  # A^i B
-        self._open = np.array([power @ self._spread for power in powers[:-1]])  # A^i S
+        self._open_loop = np.array([power @ self._noise_root for power in powers[:-1]])  # A^i S
         self.gamma, self.gamma_eq = self._means()
         self.p, self.q, self.c_0 = self._covariance_cost()
 
@@ -228,7 +226,7 @@ class Horizon:
 
     @property
     def sigma_z(self) -> Array:
-        """Σ_z of z = (x_N, u_N … u_{H-1}), of the inputs what the state feels."""
+        """Σ_z of z = (x_N, u_N … u_{H-1}), with inputs reduced to those that act on the state."""
         n_x = self.component.a.shape[0]
         select = block_diag(np.eye(n_x), *[self.drive] * self.tau)
         sigma: Array = select @ self.component.sigma_z @ select.T
@@ -240,30 +238,32 @@ class Horizon:
         return len(self.gains)
 
     def state_noise(self, t: int, c: Array) -> Affine:
-        """c x_t without its mean, c (m, n_x), as coefficients of ω: (m · width,), row by row."""
+        """Return c (x_t - x̄_t), c (m, n_x), as coefficients of ω: (m · width,), row by row."""
+        # Σ_{r<t} c A^{t-1-r} S ω_r + Σ_{s<t} c A^{t-1-s} B Σ_r M_{s,r} w_r
         m = c.shape[0]
         offset = np.zeros((m, self.past + self.steps, self._n_w))
         for r in range(-self.past, t):
-            offset[:, self.past + r] = c @ self._open[t - 1 - r]
+            offset[:, self.past + r] = c @ self._open_loop[t - 1 - r]
         effect = {s: c @ self._response[t - 1 - s] for s in range(t)}
         return self._affine(offset, effect)
 
     def input_noise(self, t: int, c: Array) -> Affine:
-        """c u_t without its mean, c (m, n_u), as coefficients of ω: (m · width,), row by row."""
+        """Return c (u_t - ū_t), c (m, n_u), as coefficients of ω: (m · width,), row by row."""
+        # c Σ_r M_{t,r} w_r
         return self._affine(np.zeros((c.shape[0], self.past + self.steps, self._n_w)), {t: c})
 
     def terminal_noise(self) -> Affine:
-        """z of `sigma_z` as coefficients of the past + N older disturbances, row by row."""
+        """Return z of `sigma_z` as coefficients of the past + N older disturbances, row by row."""
         parts = [self.state_noise(self.free, np.eye(self.component.a.shape[0]))]
         parts += [self.input_noise(t, self.drive) for t in range(self.free, self.steps)]
-        stacked = stack(parts)
+        stacked = stack_rows(parts)
         columns = np.tile(np.arange(self.width), stacked.offset.size // max(1, self.width))
-        # No gain acts on the newer ones, nor do they reach z.
+        # Newer ones have no gain and no effect on z.
         old = np.flatnonzero(columns < (self.past + self.free) * self._n_w)
         return Affine(stacked.offset[old], stacked.matrix[old])
 
     def _affine(self, offset: Array, effect: dict[int, Array]) -> Affine:
-        """Add the gains: `effect[s]` (m, n_u) is what u_s does to the rows."""
+        """Add the gains; `effect[s]` (m, n_u) is the effect of u_s on the rows."""
         m, width = offset.shape[0], self.width
         rows: list[int] = []
         columns: list[int] = []
@@ -282,6 +282,7 @@ class Horizon:
 
     def _means(self) -> tuple[Array, Array]:
         n_x, n_u = self.component.b.shape
+        # Γ_{t+1} = A Γ_t + B [v_t],  Γ^eq_{t+1} = A Γ^eq_t + B u_eq (t >= N)
         gamma = np.zeros((self.steps + 1, n_x, self.free * n_u))
         gamma_eq = np.zeros((self.steps + 1, n_x, self.component.u_eq.shape[1]))
         for t in range(self.steps):
@@ -294,24 +295,25 @@ class Horizon:
         return gamma, gamma_eq
 
     def _covariance_cost(self) -> tuple[Array, Array, float]:
-        """E of the stage costs (3) and of the terminal cost in (18), means taken off."""
+        """Return P, q, c_0 of the expected costs (3) and of the terminal cost in (18), without means."""
+        # J_cov = Σ_t E|x_t - x̄_t|²_Qx + E|u_t - ū_t|²_Qu + E|ξ_H - ξ̄_H|²_Pξ = ½ θ'Pθ + q'θ + c_0
         part = self.component
         state, control, terminal = _root(part.q_x), _root(part.q_u), _root(part.p_xi)
         terms = [self.state_noise(t, state) for t in range(self.steps)]
         terms += [self.input_noise(t, control) for t in range(self.steps)]
         n_x = part.a.shape[0]
-        stacked = [self.state_noise(t, np.eye(n_x)) for t in range(self.free, self.steps + 1)]
+        xi_rows = [self.state_noise(t, np.eye(n_x)) for t in range(self.free, self.steps + 1)]
         weight = sparse.kron(sparse.csr_array(terminal), sparse.eye_array(self.width), format="csr")
-        xi = stack(stacked)
+        xi = stack_rows(xi_rows)
         terms.append(Affine(np.asarray(weight @ xi.offset), sparse.csr_array(weight @ xi.matrix)))
-        everything = stack(terms)
-        gram = (everything.matrix.T @ everything.matrix).toarray()
-        linear = everything.matrix.T @ everything.offset
-        return 2.0 * gram, 2.0 * linear, float(everything.offset @ everything.offset)
+        total = stack_rows(terms)
+        gram = (total.matrix.T @ total.matrix).toarray()
+        linear = total.matrix.T @ total.offset
+        return 2.0 * gram, 2.0 * linear, float(total.offset @ total.offset)
 
 
-def _fed_back(t: int, delay: int, free: int, past: int) -> range:
-    """Disturbances r that M_{t,r} feeds back."""
+def _find_feedback_range(t: int, delay: int, free: int, past: int) -> range:
+    """Return the disturbances r that M_{t,r} feeds back: r <= t - d_t and r < N."""
     if t >= free and t - delay >= free:
         raise DesignError(
             "schedule.delays",
@@ -321,28 +323,28 @@ def _fed_back(t: int, delay: int, free: int, past: int) -> range:
     return range(-past, max(-past, min(t - delay + 1, free)))
 
 
-def _shown(e: Array, w: Array) -> tuple[Array, Array, Array]:
-    """(S, T, R): E w = S ω for ω ~ N(0, I), what is fed back is T w, and T w = R ω.
+def _factor_feedback(e: Array, w: Array) -> tuple[Array, Array, Array]:
+    """Return (S, T, R): E w = S ω for ω ~ N(0, I), the feedback uses T w, and T w = R ω.
 
-    T = I, S = E R and R Rᵀ = W unless some of the disturbances cannot be told apart from the state.
+    T = I, S = E R and R R' = W unless the state cannot tell some disturbances apart.
     """
     root = _cholesky(w)
-    spread = e @ root
-    size = np.linalg.norm(spread, axis=1)
+    noise_root = e @ root
+    size = np.linalg.norm(noise_root, axis=1)
     size = np.where(size > 0.0, size, 1.0)
-    left, singular, _ = np.linalg.svd(spread / size[:, None], full_matrices=False)
+    left, singular, _ = np.linalg.svd(noise_root / size[:, None], full_matrices=False)
     rank = int(np.sum(singular > RANK_TOLERANCE * singular.max(initial=0.0)))
     if rank == np.count_nonzero(np.diagonal(w)):
-        return spread, np.eye(len(w)), root
+        return noise_root, np.eye(len(w)), root
     left, singular = left[:, :rank], singular[:rank]
     inverse = (left / singular).T / size
-    told: Array = inverse @ e
-    told[np.abs(told) < RANK_TOLERANCE * (np.abs(inverse) @ np.abs(e))] = 0.0
-    return size[:, None] * left * singular, told, np.eye(rank)
+    feedback: Array = inverse @ e
+    feedback[np.abs(feedback) < RANK_TOLERANCE * (np.abs(inverse) @ np.abs(e))] = 0.0
+    return size[:, None] * left * singular, feedback, np.eye(rank)
 
 
-def _felt(b: Array) -> Array:
-    """Rows of B, as many as its rank, that tell what of an input the state feels: the identity if that is all of it."""
+def _select_input_rows(b: Array) -> Array:
+    """Return rows of B that span its row space: the inputs that act on the state; the identity at full column rank."""
     unit_x, unit_u = equilibrate(b)
     scaled = b * np.outer(unit_x, unit_u)
     _, triangle, order = qr(scaled.T, mode="economic", pivoting=True)
@@ -351,7 +353,7 @@ def _felt(b: Array) -> Array:
 
 
 def _cholesky(w: Array) -> Array:
-    """Lower triangular L with L Lᵀ = W, positive semi-definite; other units of w scale its rows only."""
+    """Return the lower triangular L with L L' = W, positive semi-definite; units of w scale its rows only."""
     lower = np.zeros_like(w)
     for j in range(len(w)):
         rest = w[j:, j] - lower[j:, :j] @ lower[j, :j]
@@ -361,7 +363,7 @@ def _cholesky(w: Array) -> Array:
 
 
 def _root(matrix: Array) -> Array:
-    """Symmetric root of a positive semi-definite matrix; diagonal stays diagonal."""
+    """Return the symmetric root of a positive semi-definite matrix; diagonal stays diagonal."""
     if np.array_equal(matrix, np.diag(np.diagonal(matrix))):
         return np.diag(np.sqrt(np.diagonal(matrix)))
     values, vectors = np.linalg.eigh(matrix)
@@ -369,45 +371,38 @@ def _root(matrix: Array) -> Array:
     return root
 
 
-def stack(parts: list[Affine]) -> Affine:
-    """Affine maps below one another."""
+def stack_rows(parts: list[Affine]) -> Affine:
+    """Stack affine maps."""
     return Affine(
         np.concatenate([part.offset for part in parts]),
         sparse.csr_array(sparse.vstack([part.matrix for part in parts])),
     )
 
 
-def horizon_of(design: Design, component: Component) -> Horizon:
-    """The prediction of a design's component."""
+def make_horizon(design: Design, component: Component) -> Horizon:
+    """Return the prediction of a component of a design."""
     return Horizon(component, design.horizon, design.terminal.tau, design.schedule, design.past)
 
 
-# The terminal condition Σ_ξ - Ξ_H ⪰ 0 of (19c) without its empty interior.
-#
-# The last τ disturbances reach both sides alike, so (19c) is Cov(z) ⪯ Σ_z for z = (x_N, u_N … u_{H-1}) and the N older
-# disturbances. Columns of z that no gain acts on are constant and move to the right side, R = Σ_z - Z_c Z_cᵀ. On the
-# range of R, whitened, what is left is ‖Y(θ)‖₂ <= 1; off that range z must not move: linear equalities.
-
-
-# A deviation whose variance RANK_TOLERANCE calls empty.
+# A deviation whose variance is below RANK_TOLERANCE.
 _EMPTY = float(np.sqrt(RANK_TOLERANCE))
 
 
 @dataclass(frozen=True, eq=False)
 class TerminalBound:
-    """I - Y Yᵀ ⪰ 0 with Y (rows, columns), row by row affine in θ, and `fixed` = 0, linearly independent.
+    """Condition I - Y Y' ⪰ 0 with Y (rows, columns), row by row affine in θ, and independent equations `fixed` = 0.
 
-    `least` is the least eigenvalue of R, scaled to unit variances; below zero, no θ meets (19c).
+    `least_eigenvalue` is the least eigenvalue of R, scaled to unit variances; below zero, no θ meets (19c).
     """
 
     y: Affine
     rows: int
     columns: int
     fixed: Affine
-    least: float
+    least_eigenvalue: float
 
     def triangle(self) -> Affine:
-        """Upper triangle of [[I, Y], [Yᵀ, I]], column by column."""
+        """Return the upper triangle of [[I, Y], [Y', I]], column by column."""
         size = self.rows + self.columns
         place = np.full((size, size), -1)
         place[: self.rows, self.rows :] = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
@@ -431,46 +426,49 @@ def terminal_bound(horizon: Horizon, *, move_constants: bool = True) -> Terminal
     n_z = sigma.shape[0]
     n_columns = z.offset.size // n_z
     column = np.tile(np.arange(n_columns), n_z)
-    acted = np.zeros(n_columns, dtype=bool)
-    acted[column[np.diff(z.matrix.indptr) > 0]] = True
-    kept = acted if move_constants else np.ones(n_columns, dtype=bool)
+    has_gain = np.zeros(n_columns, dtype=bool)
+    has_gain[column[np.diff(z.matrix.indptr) > 0]] = True
+    kept = has_gain if move_constants else np.ones(n_columns, dtype=bool)
     constant = z.offset.reshape(n_z, n_columns)[:, ~kept]
     scale = np.sqrt(np.diagonal(sigma))
     scale = np.where(scale > 0, scale, 1.0)
+    # S⁻¹ (Σ_z - Z_c Z_c') S⁻¹ = V Λ V',  Y = Λ^-½ V' S⁻¹ Z
     values, vectors = np.linalg.eigh((sigma - constant @ constant.T) / np.outer(scale, scale))
     inside = values > RANK_TOLERANCE
     whiten = (vectors[:, inside] / np.sqrt(values[inside])).T / scale
     outside = vectors[:, ~inside].T / scale
     select = np.flatnonzero(kept[column])
-    rest = Affine(z.offset[select], z.matrix[select])
+    z_kept = Affine(z.offset[select], z.matrix[select])
     return TerminalBound(
-        y=_times(whiten, rest, int(kept.sum())),
+        y=_multiply(whiten, z_kept, int(kept.sum())),
         rows=whiten.shape[0],
         columns=int(kept.sum()),
-        fixed=_independent(_times(outside, rest, int(kept.sum())), _effect(rest, np.repeat(scale, kept.sum()))),
-        least=float(values[0]),
+        fixed=_reduce_equations(
+            _multiply(outside, z_kept, int(kept.sum())), _find_largest_effects(z_kept, np.repeat(scale, kept.sum()))
+        ),
+        least_eigenvalue=float(values[0]),
     )
 
 
-def _times(matrix: Array, z: Affine, columns: int) -> Affine:
-    """matrix · Z for Z stored row by row."""
+def _multiply(matrix: Array, z: Affine, columns: int) -> Affine:
+    """Return matrix · Z for Z stored row by row."""
     wide = sparse.kron(sparse.csr_array(matrix), sparse.eye_array(columns), format="csr")
     return Affine(np.asarray(wide @ z.offset), sparse.csr_array(wide @ z.matrix))
 
 
-def _effect(z: Affine, std: Array) -> Array:
-    """Largest effect of each gain on an entry of z, in standard deviations; 1 for gains without any."""
+def _find_largest_effects(z: Affine, std: Array) -> Array:
+    """Return the largest effect of each gain on an entry of z, in standard deviations; 1 for gains without effect."""
     largest = np.abs(z.matrix.toarray() / std[:, None]).max(axis=0, initial=0.0)
     return np.where(largest > 0.0, largest, 1.0)
 
 
-def _independent(rows: Affine, effect: Array) -> Affine:
-    """Linearly independent equations with the same solutions; what no gain moves is left out unless it is not 0."""
+def _reduce_equations(rows: Affine, effect: Array) -> Affine:
+    """Return independent equations with the same solutions; constant ones are dropped unless they are not 0."""
     left, singular, right = np.linalg.svd(rows.matrix.toarray() / effect)
     rank = int(np.sum(singular > _EMPTY))
-    along, beside = left[:, :rank].T @ rows.offset, left[:, rank:].T @ rows.offset
-    contradiction = beside[np.abs(beside) > _EMPTY]
+    range_part, null_part = left[:, :rank].T @ rows.offset, left[:, rank:].T @ rows.offset
+    contradiction = null_part[np.abs(null_part) > _EMPTY]
     return Affine(
-        np.concatenate([along / singular[:rank], contradiction]),
+        np.concatenate([range_part / singular[:rank], contradiction]),
         sparse.csr_array(np.vstack([right[:rank] * effect, np.zeros((contradiction.size, effect.size))])),
     )

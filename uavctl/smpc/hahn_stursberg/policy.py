@@ -1,10 +1,10 @@
 """The frozen policy of one component: the gains of least covariance cost within half the room of every limit.
 
-1. J_cov(θ) = ½ θᵀPθ + qᵀθ + c_0 is minimised once, in Clarabel, subject to the terminal condition and to
+1. J_cov(θ) = ½ θ'Pθ + q'θ + c_0 is minimised once, in Clarabel, subject to the terminal condition and to
    κ_i ‖noise_i(θ)‖ <= ρ_i, with ρ_i half the room between the two limits of row i.
-2. Its multipliers give a cut J_cov(θ) >= D - μᵀβ(θ), with the back-offs β, that holds for every θ that keeps the
-   terminal condition, whatever the solver's error: the multipliers are projected on the dual cones first, and what then
-   is left of stationarity is paid for (P ≻ 0; theory notes, C).
+2. Its multipliers give a cut J_cov(θ) >= D - μ'β(θ), with the back-offs β. It holds for every θ that keeps the terminal
+   condition, for any error of the solver: the multipliers are projected on the dual cones first, and D includes the
+   residual of stationarity (P ≻ 0; theory notes, C).
 """
 
 from __future__ import annotations
@@ -19,44 +19,46 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from uavctl.arrays import Array
-from uavctl.smpc.hahn_stursberg.cones import conic_settings, unless_panic
+from uavctl.smpc.hahn_stursberg.cones import catch_panic, conic_settings
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon, terminal_bound
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row
 
-# A multiplier that weighs less than this share of the cost is the solver's rounding.
-_NOTHING = 1e-7
+# A multiplier with a smaller share of the cost is the solver's rounding.
+_MIN_WEIGHT = 1e-7
 
-# Where a row has one side only, the policy's back-off there is bounded by this many usual ones.
-_FAR = 1e3
+# Bound of the back-off of a row with one side, in back-offs of the cheapest gains.
+_MAX_USUAL = 1e3
 
-# Amount by which a policy may miss the terminal condition, scaled to unit variances.
-_KEPT = 1e-6
+# Largest violation of the terminal condition, scaled to unit variances.
+_MAX_VIOLATION = 1e-6
 
-_ENDED_WELL = ("Solved", "AlmostSolved", "InsufficientProgress")
+_ACCEPTED = ("Solved", "AlmostSolved", "InsufficientProgress")
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """Gains of one component, and the cut that the multipliers of their program give."""
+    """Gains of one component, and the cut from the multipliers of their program."""
 
     theta: Array  # gains (n_θ,)
-    backoff: Array  # its back-off in every link row (n_l,)
+    backoff: Array  # its back-offs in the gain rows (n_l,)
     cost: float  # J_cov
     level: float  # D of the cut
     slope: Array  # μ (n_l,), >= 0
 
 
-class Covariance:
-    """Cost and constraints of the gains of one component, and the cut that multipliers give."""
+class CovarianceProblem:
+    """Cost and constraints of the gains of one component, and the cut from multipliers."""
 
-    def __init__(self, horizon: Horizon, links: Sequence[Row]) -> None:
+    def __init__(self, horizon: Horizon, gain_rows: Sequence[Row]) -> None:
         self.horizon = horizon  # the component's prediction
-        self.kappa = np.array([row.kappa for row in links])  # κ of the link rows (n_l,)
+        self.kappa = np.array([row.kappa for row in gain_rows])  # κ of the gain rows (n_l,)
         self.scale = max(horizon.c_0, 1e-12)  # a typical cost
-        self.noises = [_with_unseen(row) for row in links]  # noise of each link row, affine in θ
+        self.noises = [_add_error_variance(row) for row in gain_rows]  # noise of each gain row, affine in θ
         self._values, self._vectors = np.linalg.eigh(horizon.p)
         # Back-offs (n_l,) of the gains that minimise J_cov alone
-        self.usual = self.backoffs(np.asarray(-np.linalg.lstsq(horizon.p, horizon.q, rcond=None)[0], dtype=np.float64))
+        self.cheapest_backoffs = self.backoffs(
+            np.asarray(-np.linalg.lstsq(horizon.p, horizon.q, rcond=None)[0], dtype=np.float64)
+        )
         reduced = terminal_bound(horizon)
         self.equal = reduced.fixed  # equalities of the reduced terminal condition
         self.order = reduced.rows + reduced.columns if reduced.rows and reduced.columns else 0  # order of its matrix
@@ -68,32 +70,35 @@ class Covariance:
             self.triangle = Affine(weight * triangle.offset, weighted)
 
     def backoffs(self, theta: Array) -> Array:
-        """Back-offs (n_l,) of the link rows under gains `theta`."""
-        backoffs: Array = self.kappa * np.array([np.linalg.norm(noise.at(theta)) for noise in self.noises])
+        """Return the back-offs (n_l,) of the gain rows under gains `theta`."""
+        # β_i = κ_i |noise_i(θ)|
+        backoffs: Array = self.kappa * np.array([np.linalg.norm(noise.evaluate(theta)) for noise in self.noises])
         return backoffs
 
     def cost(self, theta: Array) -> float:
-        """J_cov of gains `theta`."""
+        """Return J_cov = ½ θ'Pθ + q'θ + c_0 of gains `theta`."""
         return float(0.5 * theta @ self.horizon.p @ theta + self.horizon.q @ theta + self.horizon.c_0)
 
-    def holds(self, theta: Array) -> bool:
-        """Whether gains `theta` meet the terminal condition, as far as rounding lets one tell."""
-        if self.equal.offset.size and np.abs(self.equal.at(theta)).max() > _KEPT:
+    def keeps_terminal(self, theta: Array) -> bool:
+        """Return whether gains `theta` meet the terminal condition, up to rounding."""
+        if self.equal.offset.size and np.abs(self.equal.evaluate(theta)).max() > _MAX_VIOLATION:
             return False
         if not self.order:
             return True
-        matrix = _matrix(self.triangle.at(theta), self.order)
-        return bool(np.linalg.eigvalsh(matrix)[0] >= -_KEPT)
+        matrix = _unpack_triangle(self.triangle.evaluate(theta), self.order)
+        return bool(np.linalg.eigvalsh(matrix)[0] >= -_MAX_VIOLATION)
 
-    def policy(self, theta: Array, equal: Array, triangle: Array, heads: Array, tails: Sequence[Array]) -> Policy:
-        """The policy of gains `theta`, with the cut of any multipliers (theory notes, C).
+    def make_policy(self, theta: Array, equal: Array, triangle: Array, heads: Array, tails: Sequence[Array]) -> Policy:
+        """Make the policy of gains `theta`, with the cut of any multipliers (theory notes, C).
 
         Args:
             theta: Gains (n_θ,).
-            triangle: Of the terminal triangle, in its scaled form.
-            heads: Of the back-offs (n_l,), in units of cost per standard deviation.
-            tails: Of the entries below each head.
+            equal: Multipliers of the terminal equalities.
+            triangle: Multipliers of the terminal triangle, in its scaled form.
+            heads: Multipliers of the back-offs (n_l,), in cost per standard deviation.
+            tails: Multipliers of the entries below each head.
         """
+        # g = q - E'λ - T'Z⁺ - Σ N_i't_i,  D = c_0 - e'λ - t'Z⁺ - Σ n_i't_i - ½ g'P⁻¹g,  μ_i = max(h_i, |t_i|) / κ_i
         backoff = self.backoffs(theta)
         level, residual = self.horizon.c_0, self.horizon.q - self.equal.matrix.T @ equal
         level -= float(self.equal.offset @ equal)
@@ -103,30 +108,29 @@ class Covariance:
             level -= float(self.triangle.offset @ positive)
         slope = np.zeros(self.kappa.size)
         for i, (noise, head, tail) in enumerate(zip(self.noises, heads, tails, strict=True)):
-            if head * self.usual[i] < _NOTHING * self.scale * self.kappa[i]:
+            if head * self.cheapest_backoffs[i] < _MIN_WEIGHT * self.scale * self.kappa[i]:
                 continue
             slope[i] = max(float(head), float(np.linalg.norm(tail))) / self.kappa[i]
             residual = residual - noise.matrix.T @ tail
             level -= float(noise.offset @ tail)
         along = self._vectors.T @ residual
-        # P is definite: what is not, is rounding. A curvature taken too small only loosens the cut.
+        # P is definite; smaller eigenvalues are rounding. A curvature that is too small only loosens the cut.
         level -= 0.5 * float(np.sum(along**2 / np.maximum(self._values, 1e-16 * self._values.max(initial=0.0))))
         return Policy(theta, backoff, self.cost(theta), level, slope)
 
 
 def cheapest_policy(problem: MeanProblem, max_iterations: int) -> Policy | None:
-    """Policy of least covariance cost whose back-offs take at most half the room between a row's two limits.
+    """Return the policy of least covariance cost whose back-offs take at most half the room between two limits.
 
-    Variables of the program: the gains θ, and the standard deviation s_i of each row that they move.
-    None where the solver finds no such policy.
+    Variables of the program: the gains θ, and the standard deviation s_i of each gain row. None without a solution.
     """
-    links = problem.links
-    cov = Covariance(problem.horizon, [problem.rows[i] for i in links])
-    n_theta, n_l = problem.horizon.n_theta, links.size
+    gain_rows = problem.gain_rows
+    cov = CovarianceProblem(problem.horizon, [problem.rows[i] for i in gain_rows])
+    n_theta, n_l = problem.horizon.n_theta, gain_rows.size
     # κ_i s_i <= ρ_i
-    half_room = 0.5 * (problem.upper - problem.lower)[links]
-    room = np.where(np.isfinite(half_room), half_room, _FAR * cov.usual)
-    blocks = [_in_all(np.zeros((n_l, n_theta)), np.diag(cov.kappa))]
+    half_room = 0.5 * (problem.upper - problem.lower)[gain_rows]
+    room = np.where(np.isfinite(half_room), half_room, _MAX_USUAL * cov.cheapest_backoffs)
+    blocks = [_join_columns(np.zeros((n_l, n_theta)), np.diag(cov.kappa))]
     constants = [room]
     cones: list[clarabel.Cone] = [clarabel.NonnegativeConeT(n_l)]
     # The reduced terminal condition: equalities, and a positive semi-definite matrix
@@ -135,17 +139,17 @@ def cheapest_policy(problem: MeanProblem, max_iterations: int) -> Policy | None:
         (cov.triangle, clarabel.PSDTriangleConeT(cov.order)),
     ):
         if part.offset.size:
-            blocks.append(_in_all(-part.matrix.toarray(), np.zeros((part.offset.size, n_l))))
+            blocks.append(_join_columns(-part.matrix.toarray(), np.zeros((part.offset.size, n_l))))
             constants.append(part.offset)
             cones.append(cone)
     # s_i >= ‖noise_i(θ)‖
     for noise, unit in zip(cov.noises, np.eye(n_l), strict=True):
         size = noise.offset.size
         gains = np.vstack([np.zeros(n_theta), -noise.matrix.toarray()])
-        blocks.append(_in_all(gains, np.vstack([-unit, np.zeros((size, n_l))])))
+        blocks.append(_join_columns(gains, np.vstack([-unit, np.zeros((size, n_l))])))
         constants.append(np.append(0.0, noise.offset))
         cones.append(clarabel.SecondOrderConeT(size + 1))
-    # ½ θᵀPθ + qᵀθ, in units of a typical cost
+    # ½ θ'Pθ + q'θ, in units of a typical cost
     quadratic = np.zeros((n_theta + n_l, n_theta + n_l))
     quadratic[:n_theta, :n_theta] = np.triu(problem.horizon.p)
     linear = np.append(problem.horizon.q, np.zeros(n_l))
@@ -157,58 +161,60 @@ def cheapest_policy(problem: MeanProblem, max_iterations: int) -> Policy | None:
         cones,
         conic_settings(max_iterations, sum(constant.size for constant in constants)),
     )
-    solution = unless_panic(solver.solve)
-    if solution is None or str(solution.status) not in _ENDED_WELL:
+    solution = catch_panic(solver.solve)
+    if solution is None or str(solution.status) not in _ACCEPTED:
         return None
     theta = np.array(solution.x)[:n_theta]
-    if not cov.holds(theta):
+    if not cov.keeps_terminal(theta):
         return None
     dual = np.array(solution.z)[n_l:] * cov.scale
     equal, triangle, rest = np.split(dual, np.cumsum([cov.equal.offset.size, cov.triangle.offset.size]))
     ends = np.cumsum([0, *(noise.offset.size + 1 for noise in cov.noises)]).tolist()
-    of_links = [rest[i:j] for i, j in pairwise(ends)]
-    heads, tails = np.array([link[0] for link in of_links]), [link[1:] for link in of_links]
-    return cov.policy(theta, equal, triangle, heads, tails)
+    multipliers = [rest[i:j] for i, j in pairwise(ends)]
+    heads, tails = np.array([link[0] for link in multipliers]), [link[1:] for link in multipliers]
+    return cov.make_policy(theta, equal, triangle, heads, tails)
 
 
-def _in_all(of_gains: Array, of_deviations: Array) -> sparse.csr_array:
-    """Rows over all variables of the program."""
+def _join_columns(of_gains: Array, of_deviations: Array) -> sparse.csr_array:
+    """Return rows over all variables of the program."""
     return sparse.csr_array(np.hstack([of_gains, of_deviations]))
 
 
-def _with_unseen(row: Row) -> Affine:
-    """A link row's noise with the variance that no feedback sees as one more entry; empty rows left out."""
+def _add_error_variance(row: Row) -> Affine:
+    """Return a gain row's noise with the standard deviation of the constant part as one more entry."""
     assert row.noise is not None
-    moved = np.diff(row.noise.matrix.indptr) > 0
-    constant = float(np.sqrt(np.sum(row.noise.offset[~moved] ** 2) + row.unseen))
-    matrix = sparse.vstack([row.noise.matrix[np.flatnonzero(moved)], sparse.csr_array((1, row.noise.matrix.shape[1]))])
-    return Affine(np.append(row.noise.offset[moved], constant), sparse.csr_array(matrix))
+    has_gain = np.diff(row.noise.matrix.indptr) > 0
+    constant = float(np.sqrt(np.sum(row.noise.offset[~has_gain] ** 2) + row.error_variance))
+    matrix = sparse.vstack(
+        [row.noise.matrix[np.flatnonzero(has_gain)], sparse.csr_array((1, row.noise.matrix.shape[1]))]
+    )
+    return Affine(np.append(row.noise.offset[has_gain], constant), sparse.csr_array(matrix))
 
 
 def _svec_weight(order: int) -> Array:
-    row, column = _places(order)
+    row, column = _triangle_indices(order)
     return np.where(row == column, 1.0, np.sqrt(2.0))
 
 
 def _positive_part(svec: Array, order: int) -> Array:
-    """Project a symmetric matrix, upper triangle column by column with off-diagonals times √2, on the semidefinite."""
-    values, vectors = np.linalg.eigh(_matrix(svec, order))
+    """Project a symmetric matrix, upper triangle by columns with off-diagonals times √2, on the semidefinite cone."""
+    values, vectors = np.linalg.eigh(_unpack_triangle(svec, order))
     positive = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    row, column = _places(order)
+    row, column = _triangle_indices(order)
     projected: Array = _svec_weight(order) * positive[row, column]
     return projected
 
 
-def _matrix(svec: Array, order: int) -> Array:
-    """The symmetric matrix of such a triangle."""
-    row, column = _places(order)
+def _unpack_triangle(svec: Array, order: int) -> Array:
+    """Return the symmetric matrix of such a triangle."""
+    row, column = _triangle_indices(order)
     matrix = np.zeros((order, order))
     matrix[row, column] = matrix[column, row] = svec / _svec_weight(order)
     return matrix
 
 
-def _places(order: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of an upper triangle, column by column."""
+def _triangle_indices(order: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns of an upper triangle, column by column."""
     column = np.repeat(np.arange(order), np.arange(1, order + 1))
     row = np.concatenate([np.arange(j + 1) for j in range(order)])
     return row, column

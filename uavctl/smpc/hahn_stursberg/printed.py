@@ -1,12 +1,11 @@
-"""Problem (19) as printed, in CVXPY: the reference that every faster form is measured against.
+"""Problem (19) as printed, in CVXPY: the reference for every faster form.
 
-Nothing is reduced here: the terminal condition is the full matrix inequality Σ_ξ - Ξ_H ⪰ 0, the gains are matrices,
-and the covariances come from the recursion (1). The target takes the place of the origin.
-
-(19c) has no interior, and an interior-point method shows it. With Clarabel's own settings the paper's example (τ = 4)
-ends INACCURATE, one axis up to 1e-6 and both jointly 6e-7 off, and a plant with coupled axes can fail altogether. With
-REGULARIZATION in the linear algebra nearly all end OPTIMAL and agree with the reduced form to 1e-8, the joint problem
-after some ten times the time of its axes. What remains inaccurate is reported as such and does not fly.
+1. Nothing is reduced: the terminal condition is the full matrix inequality Σ_ξ - Ξ_H ⪰ 0, the gains are matrices, and
+   the covariances follow from the recursion (1). The target takes the place of the origin.
+2. (19c) has no interior, which limits an interior-point method. With Clarabel's own settings the paper's example
+   (τ = 4) ends INACCURATE, one axis up to 1e-6 and both jointly 6e-7 off, and a plant with coupled axes can fail. With
+   REGULARIZATION nearly all end OPTIMAL and agree with the reduced form to 1e-8; the joint problem takes ten times as
+   long as its axes. An inaccurate answer is reported as such and does not fly.
 """
 
 from __future__ import annotations
@@ -19,17 +18,17 @@ import numpy as np
 from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, clip_inputs, is_finite
-from uavctl.smpc.hahn_stursberg.cones import unless_panic
+from uavctl.smpc.hahn_stursberg.cones import catch_panic
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import PartAnswer, assemble
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, whole
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_whole_component
 
 METHOD = "printed"
 
-# Static regularization of the linear systems: the empty interior of (19c) makes them singular at the optimum. With the
-# solver's own value the joint problem ends inaccurate or fails; with this one it ends optimal, at the same cost.
+# Static regularization of the linear systems: the empty interior of (19c) makes them singular at the optimum. With
+# Clarabel's default the joint problem ends inaccurate or fails; with this value it ends optimal, at the same cost.
 REGULARIZATION = 1e-6
-SOLVERS_OWN = 1e-8
+CLARABEL_REGULARIZATION = 1e-8  # Clarabel's default
 
 _STATUS = {
     cp.OPTIMAL: SolveStatus.OPTIMAL,
@@ -41,17 +40,17 @@ _STATUS = {
 
 
 class PrintedProblem:
-    """(19) for one component, compiled once with the state as a parameter."""
+    """Problem (19) of one component, compiled once with the state as a parameter."""
 
     def __init__(self, design: Design, component: Component, regularization: float = REGULARIZATION) -> None:
-        """Write the problem down for `component`; `whole(design)` makes it the joint problem."""
+        """Write the problem of `component`; with `make_whole_component(design)` it is the joint problem."""
         self.component, self._design = component, design
         self._regularization = regularization
         part, H, tau = component, design.horizon, design.terminal.tau
         n_x, n_u = part.b.shape
-        # Where nothing disturbs the component, a disturbance without effect stands for none, and no gain answers it.
-        calm = not part.w.size
-        e, w = (np.zeros((n_x, 1)), np.zeros((1, 1))) if calm else (part.e, part.w)
+        # A component without disturbances gets one without effect, and no gains.
+        is_undisturbed = not part.w.size
+        e, w = (np.zeros((n_x, 1)), np.zeros((1, 1))) if is_undisturbed else (part.e, part.w)
         n_w = e.shape[1]
         root_w = _root(w)
         self._x = cp.Parameter(n_x)
@@ -62,7 +61,7 @@ class PrintedProblem:
         self._v = cp.Variable((H, n_u))
         self._m = {
             (t, r): cp.Variable((n_u, n_w))
-            for t in range(0 if calm else H)
+            for t in range(0 if is_undisturbed else H)
             for r in range(max(0, t - design.schedule.delays[t] + 1))
         }
 
@@ -73,10 +72,10 @@ class PrintedProblem:
         for t in range(H):
             blocks = [self._m.get((t, r), np.zeros((n_u, n_w))) for r in range(H)]
             self._gain.append(cp.hstack(blocks) @ np.kron(np.eye(H), root_w))
-            enter = np.zeros((n_x, H * n_w))
-            enter[:, t * n_w : (t + 1) * n_w] = e @ root_w
+            noise = np.zeros((n_x, H * n_w))
+            noise[:, t * n_w : (t + 1) * n_w] = e @ root_w
             mean.append(part.a @ mean[-1] + part.b @ self._v[t])
-            effect.append(part.a @ effect[-1] + part.b @ self._gain[-1] + enter)
+            effect.append(part.a @ effect[-1] + part.b @ self._gain[-1] + noise)
         self._effect = effect
 
         # (18), (3): expectations are squares of means and traces of covariances.
@@ -97,14 +96,14 @@ class PrintedProblem:
             for c, b in zip(part.c_u, part.b_u, strict=True):
                 constraints.append(c @ self._v[t] + design.kappa_u[t] * cp.norm(c @ self._gain[t]) <= b)
 
-        # (19c): ξ̄_H = 0 (here: at rest in the target), Σ_ξ - Ξ_H ⪰ 0 by its Schur complement; both are 0 in the calm.
+        # (19c): ξ̄_H = 0 (here: at rest in the target), Σ_ξ - Ξ_H ⪰ 0 by its Schur complement; both are 0 undisturbed.
         constraints.append(xi_mean == 0)
-        if not calm:
+        if not is_undisturbed:
             constraints.append(cp.bmat([[part.sigma_xi, xi_effect], [xi_effect.T, np.eye(H * n_w)]]) >> 0)
         self._problem = cp.Problem(cp.Minimize(cost), constraints)
 
     def solve(self, x: Array, target: Array) -> PartAnswer:
-        """Solve for the whole plant's state (n_x,) and target (n_x,)."""
+        """Solve for a state (n_x,) and a target (n_x,) of the whole plant."""
         part, design = self.component, self._design
         self._x.value, self._x_s.value = x[part.states], target[part.states]
         self._u_s.value = part.u_eq @ (part.coordinates @ self._x_s.value)
@@ -135,7 +134,7 @@ class PrintedProblem:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Solution may be inaccurate")  # the status says so
             try:
-                value = unless_panic(self._solve)
+                value = catch_panic(self._solve)
             except cp.SolverError:
                 value = None
         if value is None:
@@ -167,13 +166,13 @@ class PrintedSolver:
             DesignError: The design cannot be decomposed.
         """
         self._design = design
-        components = (whole(design),) if joint else decompose(design)
+        components = (make_whole_component(design),) if joint else decompose(design)
         self._problems = tuple(PrintedProblem(design, component, regularization) for component in components)
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); never raises on numbers.
 
-        The printed problem knows no preview: with limits of their own, a path or a late position the answer is FAILED.
+        The printed problem has no preview: with limits, a path or a late position the answer is FAILED.
         """
         if not is_finite(x, target, preview) or not preview.nominal:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
@@ -182,7 +181,7 @@ class PrintedSolver:
 
 
 def _root(matrix: Array) -> Array:
-    """Symmetric root of a positive semi-definite matrix."""
+    """Return the symmetric root of a positive semi-definite matrix."""
     values, vectors = np.linalg.eigh(matrix)
     root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return root

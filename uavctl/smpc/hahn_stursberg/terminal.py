@@ -1,4 +1,10 @@
-"""Terminal ingredients, Assumption 4."""
+"""Terminal ingredients (Sec. 4.3), and Assumption 4 with figures.
+
+1. Lifted system ξ_t = (x_{t-τ} … x_t) under u_t = K_τ x_{t-τ}: (10), (11), ξ⁺ = A_cl ξ + E_ξ w.
+2. Invariant covariance (Def. 2): Σ_ξ = A_cl Σ_ξ A_cl' + E_ξ W E_ξ'.
+3. Terminal weight (Assumption 4.5 with equality): P_ξ = A_cl' P_ξ A_cl + Q_ξ.
+4. A design that fails an item of Assumption 4 is refused, with the figures.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +18,7 @@ from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope, find_rest_input
 
-# Terminal system, invariant covariance, terminal weight (Sec. 4.3), and Assumption 4 with figures.
-
-
-_DOUBLINGS = 40  # 2^40 steps: enough for the largest radius that is taken
+_DOUBLINGS = 40  # 2^40 steps: enough for the largest radius allowed, 1 - 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,7 @@ def make_terminal(plant: Plant, tau: int, k: Array, q_x: Array, q_u: Array) -> T
             "smpc.k_tau", f"is not ({n_u}, {n_x}) finite numbers, its shape is {k.shape}", "one row an input"
         )
     size = (tau + 1) * n_x
+    # (10), (11): A_cl = [[0, I], [B K_τ, 0 …, A]]
     a_cl = np.zeros((size, size))
     a_cl[:-n_x, n_x:] = np.eye(tau * n_x)
     a_cl[-n_x:, -n_x:] = plant.a
@@ -59,6 +63,7 @@ def make_terminal(plant: Plant, tau: int, k: Array, q_x: Array, q_u: Array) -> T
             f"Assumption 4.2: with a delay of tau = {tau} steps the closed loop is unstable (radius {radius:.4f})",
             "take a smaller gain or a shorter smpc.tau",
         )
+    # E_ξ = [0; E],  Q_ξ = diag(K'Q_u K, 0 … 0, Q_x)
     e_xi = np.vstack([np.zeros((tau * n_x, plant.n_w)), plant.e])
     q_xi = np.zeros((size, size))
     q_xi[:n_x, :n_x] = k.T @ q_u @ k
@@ -79,7 +84,7 @@ def make_terminal(plant: Plant, tau: int, k: Array, q_x: Array, q_u: Array) -> T
 
 
 def _sigma_z(plant: Plant, tau: int, k: Array) -> Array:
-    """Σ_z of the Markov form z⁺ = F z + G w, F = [[A, B, 0 …], [0, shift], [K, 0 …]], G = [E; 0]."""
+    """Return Σ_z = F Σ_z F' + G W G' of z⁺ = F z + G w, F = [[A, B, 0 …], [0, shift], [K, 0 …]], G = [E; 0]."""
     n_x, n_u = plant.n_x, plant.n_u
     size = n_x + tau * n_u
     f = np.zeros((size, size))
@@ -92,18 +97,19 @@ def _sigma_z(plant: Plant, tau: int, k: Array) -> Array:
 
 
 def stationary_cost(terminal: Terminal) -> float:
-    """Mean stage cost (3) of the delayed law in the long run."""
+    """Return tr(Q_ξ Σ_ξ), the mean stage cost (3) of the delayed law in the long run."""
     return float(np.trace(terminal.q_xi @ terminal.sigma_xi))
 
 
 def lyapunov_residual(terminal: Terminal) -> float:
-    """Largest eigenvalue of A_clᵀ P A_cl - P + Q_ξ, relative to P: at most 0 by Assumption 4.5, up to rounding."""
+    """Return the largest eigenvalue of A_cl' P A_cl - P + Q_ξ, relative to P: at most rounding by Assumption 4.5."""
     drop = terminal.a_cl.T @ terminal.p_xi @ terminal.a_cl - terminal.p_xi + terminal.q_xi
     return float(np.linalg.eigvalsh(_symmetric(drop)).max() / np.abs(terminal.p_xi).max())
 
 
 def invariance_residual(terminal: Terminal, w: Array) -> float:
-    """Residual of Def. 2, relative to Σ_ξ."""
+    """Return the residual of Def. 2, relative to Σ_ξ."""
+    # |A_cl Σ_ξ A_cl' + E_ξ W E_ξ' - Σ_ξ| / |Σ_ξ|
     sigma = terminal.sigma_xi
     noise = terminal.e_xi @ w @ terminal.e_xi.T
     size = float(np.abs(sigma).max())
@@ -111,11 +117,12 @@ def invariance_residual(terminal: Terminal, w: Array) -> float:
 
 
 def _stationary(a: Array, q: Array) -> Array:
-    """X = A X Aᵀ + Q for a stable A, by doubling.
+    """Solve X = A X A' + Q for a stable A, by doubling.
 
-    Sums of products alone: what no disturbance reaches stays 0, and other units scale every step alike. A linear solve
-    is only as good as its largest entry, which leaves nothing of the small ones where units differ.
+    It has sums of products only: states that no disturbance reaches stay 0, and units scale each step alike. A linear
+    solve is as accurate as its largest entry, which is too coarse for the small ones where units differ.
     """
+    # X <- X + F X F',  F <- F²,  from X = Q, F = A
     x, power = q, a
     for _ in range(_DOUBLINGS):
         x = x + power @ x @ power.T
@@ -127,10 +134,7 @@ def _symmetric(matrix: NDArray[np.floating]) -> Array:
     return np.asarray((matrix + matrix.T) / 2, dtype=np.float64)
 
 
-# Assumption 4, item by item and with figures; a design that fails one is refused.
-
-
-_ROUNDING = 1e-8
+_ROUNDING = 1e-8  # largest relative residual of the Lyapunov equations
 
 
 @dataclass(frozen=True)
@@ -140,9 +144,9 @@ class AssumptionCheck:
     item: str  # its number, "4.1" … "4.5"
     ok: bool  # whether it holds
     # 4.1: P(a <= τ); 4.2: spectral radius; 4.3, 4.4: half-width of the terminal set along the row that it fills most,
-    # in the row's unit; 4.5: largest eigenvalue of AᵀPA - P + Q_ξ, relative to P_ξ
+    # in the row's unit; 4.5: largest eigenvalue of A'PA - P + Q_ξ, relative to P_ξ
     value: float
-    # What `value` stays at or below (4.1: at or above); 4.3, 4.4: the room from the equilibrium to the row
+    # Upper bound of `value` (4.1: lower bound); 4.3, 4.4: the room from the equilibrium to the row
     limit: float
     text: str  # what is compared, for people
 
@@ -164,13 +168,13 @@ def check_assumptions(
     """Check all five items at the target equilibrium.
 
     Args:
-        q_u: Q_u (n_u, n_u): of several inputs that hold the target, the cheapest is the one that plans rest with.
+        q_u: Q_u (n_u, n_u): plans rest with the cheapest input that holds the target.
         target: Equilibrium x_s (n_x,) around which the terminal set lies.
         estimate_cov: Covariance of the state estimate's error (n_x, n_x), which comes on top of Σ_x.
-        age_within_tau: The least P(a(k) <= τ).
+        age_within_tau: Least P(a(k) <= τ) of all times.
 
     Raises:
-        DesignError: An item fails; it is named with its figures.
+        DesignError: An item fails; the message names it with its figures.
     """
     k_sigma = terminal.k @ terminal.sigma_x @ terminal.k.T
     rest = find_rest_input(plant.a, plant.b, q_u, target)
@@ -185,19 +189,19 @@ def check_assumptions(
             1.0,
             f"spectral radius of the delayed loop (residual of the invariant covariance {residual:.1g})",
         ),
-        _fits("4.3", state_set, target, terminal.sigma_x + estimate_cov, kappa_x, "state"),
-        _fits("4.4", input_set, rest, k_sigma, kappa_u, "input"),
+        _check_fit("4.3", state_set, target, terminal.sigma_x + estimate_cov, kappa_x, "state"),
+        _check_fit("4.4", input_set, rest, k_sigma, kappa_u, "input"),
         AssumptionCheck("4.5", drop <= _ROUNDING, drop, _ROUNDING, "largest eigenvalue of A'PA - P + Q, relative to P"),
     )
     for check in checks:
         if not check.ok:
-            key, hint = _BLAME[check.item]
+            key, hint = _HINTS[check.item]
             reason = f"Assumption {check.item} fails: {check.text}: {check.value:.6g}, limit {check.limit:.9g}"
             raise DesignError(key, reason, hint)
     return checks
 
 
-_BLAME = {
+_HINTS = {
     "4.1": ("smpc.delta_tau", "take a larger smpc.tau or a lower smpc.delta_tau"),
     "4.2": ("smpc.k_tau", "take a smaller gain"),
     "4.3": ("target.position_m", "move the target away from the limits, widen them, or take another smpc.k_tau"),
@@ -206,20 +210,24 @@ _BLAME = {
 }
 
 
-def _fits(item: str, polytope: Polytope, center: Array, covariance: Array, kappa: float, what: str) -> AssumptionCheck:
-    """Compare the ellipsoid around `center` with the room to the limits, at the row that it fills most."""
+def _check_fit(
+    item: str, polytope: Polytope, center: Array, covariance: Array, kappa: float, quantity: str
+) -> AssumptionCheck:
+    """Compare the terminal ellipsoid around `center` with the room to the limits, at the row that it fills most."""
     if not len(polytope.b):
-        return AssumptionCheck(item, True, 0.0, np.inf, f"no {what} has a limit")
+        return AssumptionCheck(item, True, 0.0, np.inf, f"no {quantity} has a limit")
+    # κ (c'Σc)^½ <= b - c'x_s
     room = polytope.margin(center)
-    half = kappa * np.sqrt(np.einsum("ij,jk,ik->i", polytope.c, covariance, polytope.c))
-    share = np.divide(half, room, out=np.full_like(half, np.inf), where=room > 0)
+    half_width = kappa * np.sqrt(np.einsum("ij,jk,ik->i", polytope.c, covariance, polytope.c))
+    share = np.divide(half_width, room, out=np.full_like(half_width, np.inf), where=room > 0)
     row = int(np.argmax(share))
-    text = f"half-width of the terminal set at {_name(polytope.c[row], row, what)}, against the room from the target"
-    return AssumptionCheck(item, bool(half[row] <= room[row]), float(half[row]), float(room[row]), text)
+    name = _name_row(polytope.c[row], row, quantity)
+    text = f"half-width of the terminal set at {name}, against the room from the target"
+    return AssumptionCheck(item, bool(half_width[row] <= room[row]), float(half_width[row]), float(room[row]), text)
 
 
-def _name(normal: Array, row: int, what: str) -> str:
+def _name_row(normal: Array, row: int, quantity: str) -> str:
     index = np.flatnonzero(normal)
     if len(index) != 1:
-        return f"row {row} of the {what} set"
-    return f"the {'upper' if normal[index[0]] > 0 else 'lower'} limit of {what} {index[0]}"
+        return f"row {row} of the {quantity} set"
+    return f"the {'upper' if normal[index[0]] > 0 else 'lower'} limit of {quantity} {index[0]}"
