@@ -91,7 +91,6 @@ def test_row_13_a_jump_that_persists_ends_in_landing_and_is_never_believed_again
     assert modes(outputs)[:doubted] == [TRACK] * doubted
     assert set(modes(outputs)[doubted:found]) <= {BRAKE, HOLD}
     assert modes(outputs)[found] in (BRAKE, HOLD)
-    assert outputs[found].decision.reason.startswith("positions jumped")
     lands = modes(outputs).index(LAND)
     assert lands <= found + 41
     assert [tick for tick, one in enumerate(outputs) if one.land] == [lands]
