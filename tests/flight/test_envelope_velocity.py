@@ -111,6 +111,7 @@ def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None
     watching, breach = update(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
     assert watching.velocity.apart_mps == pytest.approx(0.3) and watching.velocity.is_contradicted
     assert watching.velocity.apart_ns == captured_ns
+    assert not watching.acceleration.is_hinted
     assert breach is not None
 
 
