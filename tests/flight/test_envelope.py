@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -255,8 +255,6 @@ def test_a_breach_tells_whether_the_vehicle_leans_as_it_was_told(
         own = VehicleMotion(attitude_rad=(math.atan(lean[1] / 9.81 * math.cos(pitch)), pitch, 0.0), attitude_ns=AT_NS)
     _, breach = look(unexplained, accel=(1.0, 0.0, 0.0), vehicle_motion=own)
     assert breach is not None and breach.cause == Cause.RESPONSE
-    north, east, down = unexplained
-    assert f"({north:.1f}, {east:.1f}, {down:.1f}) m/s²" in breach.text and "(1.0, 0.0, 0.0) m/s²" in breach.text
     assert breach.text.endswith(words) and ("leans" in breach.text) == bool(words)
 
 
@@ -308,19 +306,6 @@ def test_what_did_not_come_is_not_made_up_in_axes_that_the_plant_has_not() -> No
         selected = select_axes(structs.replace(silent, motion=words), parameters)
         assert selected.motion == words and selected.inertial_mps2 is None
         assert [(one.position_m, one.velocity_mps) for one in selected.samples] == [((1.0, 0.0, 0.0), None)]
-
-
-def test_a_tick_cannot_change_what_the_tick_before_left_nor_anybody_what_is_possible() -> None:
-    watching, _ = look(ZERO)
-    assert watching.motion.observer is not None
-    for thing in (watching, watching.motion.observer, seen(AT_NS), Verdict()):
-        with pytest.raises(AttributeError):
-            setattr(thing, thing.__struct_fields__[0], None)
-    with pytest.raises(FrozenInstanceError):
-        replace(PARAMETERS).begins_mps = 1.0  # type: ignore[misc]
-    # Nor are they compared by their arrays, which have no one truth.
-    assert watching != structs.replace(watching)
-    assert watching.motion.observer != structs.replace(watching.motion.observer)
 
 
 # Vehicles that fly as they are told, and frames that do not fit

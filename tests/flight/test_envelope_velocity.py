@@ -23,61 +23,17 @@ from envelope_rig import (
     seen,
     trusted_velocity,
     update,
-    vec3,
 )
 from flight_rig import MS, START_NS, sample
 from msgspec import structs
-from scipy.optimize import minimize_scalar
 
-from uavctl.arrays import SECOND_NS, Array
+from uavctl.arrays import SECOND_NS
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observer import Observer
+from uavctl.flight.monitors.velocity import VelocityState
 from uavctl.flight.monitors.verdict import Cause, Verdict
 from uavctl.records import Vec3, VehicleMotion
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    parameters = replace(PARAMETERS, disagreement_mps=100.0)
-    watching, at_ns = INITIAL, START_NS
-    ticks_ns: list[int] = []
-    flown: list[Array] = []
-    taken: list[tuple[int, Array]] = []
-    for _ in range(80):
-        at_ns += int(rng.integers(30, 90)) * MS
-        velocity = rng.normal(size=3)
-        flown.append(flown[-1] + velocity * (at_ns - ticks_ns[-1]) * 1e-9 if flown else np.zeros(3))
-        ticks_ns.append(at_ns)
-        captured_ns = at_ns - int(rng.integers(0, 30)) * MS
-        one = sample(captured_ns, at_ns, vec3(rng.normal(size=3)))
-        if captured_ns > ticks_ns[0] and (not taken or captured_ns - taken[-1][0] >= 40 * MS):
-            distance = [np.interp(captured_ns, ticks_ns, axis) for axis in np.array(flown).T]
-            taken.append((captured_ns, np.array(one.position_m) - distance))
-        watching, _ = update(watching, seen(at_ns, one, vehicle_motion=motion(vec3(velocity), at_ns)), parameters)
-        if not taken or taken[-1][0] != captured_ns:
-            continue
-        window = [one for one in taken if one[0] > captured_ns - 1200 * MS]
-        assert [at for at, _ in watching.velocity.offsets] == [at for at, _ in window]
-        if len(window) < 3 or captured_ns - window[0][0] < 360 * MS:
-            assert watching.velocity.apart_mps is None
-            continue
-        slope, _ = np.polyfit([(at - captured_ns) * 1e-9 for at, _ in window], [off for _, off in window], 1)
-        # As much of it as stamps that are up to 0.15 s late or early make is no difference.
-        middle_ns = (window[0][0] + captured_ns) // 2
-        places = [[np.interp(at, ticks_ns, axis) for axis in np.array(flown).T] for at in (window[0][0], middle_ns)]
-        half_s = (captured_ns - window[0][0]) * 0.5e-9
-        accel = (np.array(places[0]) - 2.0 * np.array(places[1]) + distance) / half_s**2
-        left = minimize_scalar(
-            lambda late_s, by=slope, a=accel: float(np.linalg.norm(by + late_s * a)),
-            bounds=(-0.15, 0.15),
-            method="bounded",
-            options={"xatol": 1e-9},
-        )
-        assert watching.velocity.apart_mps == pytest.approx(left.fun, rel=1e-6)
-    kept = [at for at in ticks_ns if at > at_ns - 3 * SECOND_NS]
-    assert [at for at, _ in watching.motion.vehicle_path] == kept
 
 
 @pytest.mark.parametrize(
@@ -93,7 +49,7 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
 def test_velocities_are_compared_over_three_positions_and_part_of_the_window(
     spans_ns: tuple[int, ...], compared: bool
 ) -> None:
-    watching, _ = look(ZERO, vehicle_motion=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
+    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
     assert watching.velocity.apart_mps == (pytest.approx(0.125) if compared else None)
     assert watching.velocity.apart_ns is None
     assert not watching.velocity.is_contradicted
@@ -109,7 +65,7 @@ def turning(accel: Vec3, slope: Vec3) -> tuple[float | None, bool]:
     nodes_ns = (times_ns[0] - 1, *times_ns, AT_NS - 1)
     way = tuple((at, 0.5 * ((at - AT_NS) * 1e-9) ** 2 * np.array(accel)) for at in nodes_ns)
     lines = tuple((at, (at - AT_NS) * 1e-9 * np.array(slope)) for at in times_ns)
-    watching, _ = look(ZERO, vehicle_motion=AT_REST, vehicle_path=way, offsets=lines)
+    watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
     return watching.velocity.apart_mps, watching.velocity.is_contradicted
 
 
@@ -119,6 +75,7 @@ def turning(accel: Vec3, slope: Vec3) -> tuple[float | None, bool]:
         (ZERO, (0.3, 0.0, 0.0), 0.3),
         ((2.0, 0.0, 0.0), (-0.2, 0.0, 0.0), 0.0),  # positions are 0.1 s late
         ((2.0, 0.0, 0.0), (0.2, 0.0, 0.0), 0.0),  # or early
+        ((0.5, 0.0, 0.0), (-0.05, 0.0, 0.0), 0.0),
         ((2.0, 0.0, 0.0), (-0.5, 0.0, 0.0), 0.2),  # no stamp is later than 0.15 s
         ((2.0, 0.0, 0.0), (0.5, 0.0, 0.0), 0.2),
         ((2.0, 0.0, 0.0), (0.0, 0.3, 0.0), 0.3),  # nor does it turn a velocity
@@ -138,7 +95,7 @@ def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
         way = tuple(
             (at, np.array([((at - AT_NS) * 1e-9) ** 2, 0.0, 0.0])) for at in (begins_ns - 1, times_ns[1], AT_NS - 1)
         )
-        watching, _ = look(ZERO, vehicle_motion=AT_REST, vehicle_path=way, offsets=lines)
+        watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
         assert watching.velocity.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
 
 
@@ -154,7 +111,8 @@ def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None
     watching, breach = update(state, seen(AT_NS, sample(captured_ns, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
     assert watching.velocity.apart_mps == pytest.approx(0.3) and watching.velocity.is_contradicted
     assert watching.velocity.apart_ns == captured_ns
-    assert breach is not None and breach.text.endswith("and none has come since")
+    assert not watching.acceleration.is_hinted
+    assert breach is not None
 
 
 @pytest.mark.parametrize(
@@ -172,7 +130,31 @@ def test_velocities_that_contradicted_each_other_and_then_no_position_comes(
 ) -> None:
     _, breach = update(monitors(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, vehicle_motion=AT_REST), PARAMETERS)
     assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
-    assert breach is None or breach.text.endswith("and none has come since")
+
+
+def test_a_velocity_that_is_contradicted_is_not_agreed_with() -> None:
+    bound_mps = PARAMETERS.disagreement_mps
+    for apart_mps, agrees in ((None, True), (bound_mps, True), (just_more(bound_mps), False)):
+        assert VelocityState(apart_mps=apart_mps).agrees(PARAMETERS) == agrees
+
+
+def test_a_contradiction_counts_from_a_window_after_the_first_second_of_positions_on() -> None:
+    since_ns = AT_NS - PARAMETERS.window_ns - SECOND_NS
+    for resumed_ns, counts in ((since_ns, True), (since_ns + 1, False)):
+        watching, _ = look(ZERO, own=AT_REST, resumed_ns=resumed_ns, **offsets(0.3))
+        assert watching.velocity.is_contradicted and (watching.velocity.apart_ns is not None) == counts
+
+
+@pytest.mark.parametrize("known", [("offsets",), ("places",), ("offsets", "places")])
+def test_a_distance_that_begins_anew_is_not_compared_with_what_was_before(known: tuple[str, ...]) -> None:
+    """Nor is one that is not known: this tick brings no position."""
+    values = {"offsets": offsets(0.0)["offsets"], "places": ((START_NS - SECOND_NS, ZERO),)}
+    before = monitors(tick_ns=START_NS, **{name: values[name] for name in known})
+    flown = ((START_NS, np.zeros(3)),)
+    for path, own, is_kept in (((), AT_REST, False), (flown, None, False), (flown, AT_REST, True)):
+        after, _ = update(changed(before, vehicle_path=path), seen(AT_NS, vehicle_motion=own), PARAMETERS)
+        kept = (bool(after.velocity.offsets), bool(after.velocity.places))
+        assert kept == (is_kept and "offsets" in known, is_kept and "places" in known)
 
 
 # The ways of half a minute
@@ -184,7 +166,7 @@ def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorStat
     middle_ns = AT_NS - 256 * MS
     older = tuple((middle_ns - age_ns - n * SECOND_NS, np.zeros(3)) for n in range(before, 0, -1))
     places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
-    return look(ZERO, vehicle_motion=AT_REST, places=places, **known)
+    return look(ZERO, own=AT_REST, places=places, **known)
 
 
 @pytest.mark.parametrize(
@@ -201,8 +183,6 @@ def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within
         watching, breach = creeping(off_m if math.isfinite(off_m) else 99.0, age_ns)
         breached = breached and math.isfinite(within_m)
         assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
-        assert breach is None or breach.text.endswith(f"away from the vehicle's own way in {age_ns * 1e-9:.0f} s")
-        assert breach is None or f"(0.0, {off_m:.1f}, 0.0) m" in breach.text
         assert not watching.velocity.is_contradicted
 
 
@@ -215,7 +195,7 @@ def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
 
 def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
     _, breach = creeping(9.0, SECOND_NS, before=3)
-    assert breach is not None and breach.text.endswith("in 1 s")
+    assert breach is not None and breach.cause == Cause.VELOCITY
 
 
 @pytest.mark.parametrize(
@@ -238,7 +218,7 @@ def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
 
 
 def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
-    watching, _ = look(ZERO, vehicle_motion=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
+    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
     ((at_ns, place),) = watching.velocity.places
     assert at_ns == AT_NS - 200 * MS
     np.testing.assert_allclose(place, (-0.125 * 0.2, 0.0, 0.0), atol=1e-12)
@@ -247,22 +227,28 @@ def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
 def test_over_a_gap_the_way_is_not_compared() -> None:
     places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
     for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
-        watching, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
+        watching, breach = look(ZERO, own=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
         assert breach is None
         assert watching.velocity.places == (places if kept else ())
     silent, _ = look(ZERO, places=places, **offsets(0.0))
-    missed, _ = look(
-        ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),))
-    )
+    missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),)))
     assert silent.velocity.places == missed.velocity.places == ()
     state = monitors(vehicle_path=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
     early, _ = update(state, seen(AT_NS, sample(START_NS, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
     assert not early.velocity.offsets and not early.velocity.places
 
 
+def test_a_contradiction_is_reported_before_scatter_and_after_an_unexplained_acceleration() -> None:
+    contradicts = offsets(9.0)
+    _, scattered = look(ZERO, off_m=9.0, own=AT_REST, clipped=(True, True), **contradicts)
+    assert scattered is not None and scattered.cause == Cause.VELOCITY
+    _, unexplained = look((9.0, 0.0, 0.0), own=AT_REST, **contradicts)
+    assert unexplained is not None and unexplained.cause == Cause.RESPONSE
+
+
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
     places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
-    _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(9.0))
+    _, breach = look(ZERO, own=AT_REST, places=places, **offsets(9.0))
     assert breach is not None and breach.text.startswith("positions move otherwise")
 
 
@@ -302,7 +288,7 @@ def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plai
     s = LOOK_NS * 1e-9
     place = s * -(s * unexplained_mps2) + 0.5 * s * s * unexplained_mps2
     known = offsets(EXACT_MPS, place_m=place, apart_ns=apart_ns)
-    watching, breach = look((unexplained_mps2, 0.0, 0.0), vehicle_motion=AT_REST, parameters=parameters, **known)
+    watching, breach = look((unexplained_mps2, 0.0, 0.0), own=AT_REST, parameters=parameters, **known)
     assert watching.velocity.apart_mps == EXACT_MPS
     assert watching.velocity.apart_ns == since_ns
     assert watching.velocity.is_contradicted == (since_ns is not None)
@@ -343,7 +329,7 @@ def test_the_way_is_remembered_for_three_seconds() -> None:
     ],
 )
 def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotion | None, known: bool) -> None:
-    watching, _ = look(ZERO, vehicle_motion=words, **offsets(0.125))
+    watching, _ = look(ZERO, own=words, **offsets(0.125))
     assert (watching.velocity.apart_mps is not None) == (len(watching.velocity.offsets) == 3) == known
     assert len(watching.motion.vehicle_path) == (3 if known else 0)
     ours = structs.replace(seen(AT_NS, vehicle_motion=words), velocity_mps=ZERO)
@@ -353,7 +339,7 @@ def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotio
 @pytest.mark.parametrize(("gap_ns", "known"), [(300 * MS, True), (300 * MS + 1, False)])
 def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, known: bool) -> None:
     before = offsets(0.0, vehicle_path=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
-    watching, _ = look(ZERO, vehicle_motion=motion((1.0, 0.0, 0.0), AT_NS), **before)
+    watching, _ = look(ZERO, own=motion((1.0, 0.0, 0.0), AT_NS), **before)
     assert watching.motion.vehicle_path[-1][0] == AT_NS
     assert watching.motion.vehicle_path[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
     assert [at for at, _ in watching.motion.vehicle_path[:-1]] == [AT_NS - gap_ns] * known

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -67,20 +66,6 @@ def test_an_impossible_previous_setpoint_does_not_lead_out_of_bounds() -> None:
         (2.0, 1.0, 0.0),
         ("slew-east",),
     )
-
-
-@pytest.mark.parametrize("changed", ["want", "previous", "bounds"])
-def test_vectors_that_are_no_triples_are_an_error_and_not_limited_in_part(changed: str) -> None:
-    pair: Vec3 = (1.0, 1.0)  # type: ignore[assignment]
-    want, previous = (pair if changed == name else ZERO for name in ("want", "previous"))
-    limits = replace(LIMITS, accel_mps2=pair) if changed == "bounds" else LIMITS
-    with pytest.raises(ValueError, match="zip"):
-        limit_setpoint(want, previous, TICK_S, limits)
-
-
-def test_nobody_changes_the_limits_in_flight() -> None:
-    with pytest.raises(FrozenInstanceError):
-        replace(LIMITS).slew_mps3 = 99.0  # type: ignore[misc]
 
 
 @pytest.mark.slow

@@ -8,16 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from envelope_rig import PARAMETERS, TICK_NS, update, vec3
+from envelope_rig import PARAMETERS, TICK_NS, monitors, seen, update, vec3
 from flight_rig import MS, START_NS, sample
+from msgspec import structs
 
 from uavctl.arrays import SECOND_NS, Array
-from uavctl.flight.monitors.acceleration import describe_acceleration, describe_push
+from uavctl.flight.monitors import acceleration
+from uavctl.flight.monitors.acceleration import AccelerationState, describe_acceleration, describe_push
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged
+from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation
-from uavctl.flight.monitors.observer import InertialSpan, extend_path, move_along
+from uavctl.flight.monitors.observer import InertialSpan, Observer, extend_path, move_along
 from uavctl.flight.monitors.verdict import Cause
-from uavctl.records import Vec3
+from uavctl.records import Vec3, VehicleMotion
 
 BOUND_MPS2 = PARAMETERS.unexplained_mps2
 LAG_S, FINE_S = np.array(PARAMETERS.lag_s), 0.001
@@ -220,6 +223,71 @@ def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() ->
 
 
 @pytest.mark.parametrize(
+    ("push_mps2", "sent_mps2", "inertial_mps2", "was_pushed", "is_pushed"),
+    [
+        (1.0, 3.0, 0.0, False, False),  # half of the bound: inertial data explain no more than chance
+        (1.001, 3.0, 0.0, False, True),
+        (3.0, 2.0, 0.0, False, False),  # positions show no more than the bound allows
+        (3.0, 2.001, 0.0, False, True),
+        (3.0, 1.0, 0.0, True, False),  # a push that was there goes on down to half of it
+        (3.0, 1.001, 0.0, True, True),
+        (3.0, 3.0, 2.0, False, True),
+        (3.0, 3.0, 2.001, False, False),  # inertial data leave more than the bound unexplained
+        (3.0, 3.0, None, False, False),
+        (0.0, 3.0, None, True, True),  # without inertial data, what they last showed holds
+    ],
+)
+def test_inertial_data_explain_a_push(
+    push_mps2: float, sent_mps2: float, inertial_mps2: float | None, was_pushed: bool, is_pushed: bool
+) -> None:
+    def unexplained(accel_mps2: float) -> Array:
+        return np.array([np.zeros(3), np.zeros(3), [accel_mps2, 0.0, 0.0]])
+
+    inertial = None if inertial_mps2 is None else unexplained(inertial_mps2)
+    observer = Observer(START_NS, unexplained(sent_mps2), np.zeros((3, 3)), np.zeros(3), inertial)
+    motion = Motion(push_mps2=(push_mps2, 0.0, 0.0), observer=observer)
+    position = PositionObservation(START_NS, np.zeros(3), False, False, motion, observer, seen(START_NS), PARAMETERS)
+    state, _ = acceleration.update(AccelerationState(is_pushed=was_pushed), position)
+    assert state.is_pushed == is_pushed
+
+
+@pytest.mark.parametrize(("shown", "is_kept"), [(None, True), ((0.0, 0.0, 0.0), False)])
+def test_a_push_stays_as_inertial_data_last_showed_it(shown: Vec3 | None, is_kept: bool) -> None:
+    observer = Observer(START_NS, np.zeros((3, 3)), np.eye(3), np.zeros(3), np.zeros((3, 3)))
+    path = extend_path((), START_NS - TICK_NS, (0.0, 0.0, 0.0), 0)
+    before = monitors(observer=observer, inertial_path=path, push_mps2=(0.5, 0.0, 0.0), tick_ns=START_NS)
+    at_ns = START_NS + TICK_NS
+    tick = structs.replace(seen(at_ns, sample(at_ns, at_ns)), inertial_mps2=shown)
+    after, _ = update(before, tick, PARAMETERS)
+    assert (after.motion.push_mps2 == (0.5, 0.0, 0.0)) == is_kept
+
+
+def test_the_path_of_inertial_data_is_kept_for_three_seconds() -> None:
+    watching = INITIAL
+    for n in range(100):
+        tick = structs.replace(seen(START_NS + n * TICK_NS), inertial_mps2=(0.1 * n, 0.0, 0.0))
+        watching, _ = update(watching, tick, PARAMETERS)
+    begins = [span.at_ns for span in watching.motion.inertial_path]
+    assert begins == [START_NS + n * TICK_NS for n in range(99 - 3 * SECOND_NS // TICK_NS, 99)]
+
+
+@pytest.mark.parametrize(("silent_ns", "is_silence"), [(SECOND_NS, False), (SECOND_NS + 1, True)])
+def test_positions_come_back_after_a_silence_of_more_than_a_second(silent_ns: int, is_silence: bool) -> None:
+    observer = Observer(START_NS, np.zeros((3, 3)), np.eye(3), np.zeros(3))
+    at_ns = START_NS + silent_ns
+    after, _ = update(monitors(observer=observer, tick_ns=START_NS), seen(at_ns, sample(at_ns, at_ns)), PARAMETERS)
+    assert after.motion.resumed_ns == (at_ns if is_silence else None)
+
+
+@pytest.mark.parametrize(
+    ("clipped", "is_quiet"), [((), True), ((True, False), True), ((False, True), False), ((True,), False)]
+)
+def test_a_position_is_quiet_unless_it_is_itself_far_off(clipped: tuple[bool, ...], is_quiet: bool) -> None:
+    state = AccelerationState(clipped=clipped)
+    assert state.is_quiet == is_quiet and not state.is_hinted
+
+
+@pytest.mark.parametrize(
     ("push", "words"),
     [
         ((2.3, 0.0, 0.0), "2.3 m/s² north."),
@@ -227,6 +295,7 @@ def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() ->
         ((0.0, -2.0, 1.0), "2.0 m/s² west."),
         ((0.1, 0.0, -2.0), "2.0 m/s² up."),
         ((-2.0, -1e-9, 0.0), "2.0 m/s² south."),
+        ((1.0, 0.0, 1.0), "1.0 m/s² north."),
     ],
 )
 def test_a_push_has_a_size_and_a_direction(push: Vec3, words: str) -> None:
@@ -252,3 +321,5 @@ def test_a_push_is_described_with_and_without_an_attitude() -> None:
     flown = fly(steady(2.0)).watching
     assert describe_push(flown.motion, None, START_NS) == describe_acceleration(flown.motion.push_mps2, None)
     assert describe_push(INITIAL.motion, None, START_NS) == describe_acceleration(INITIAL.motion.push_mps2, None)
+    leaning = VehicleMotion(attitude_rad=(0.0, 1.0, 0.0), attitude_ns=START_NS)
+    assert describe_push(flown.motion, leaning, START_NS) != describe_push(flown.motion, None, START_NS)

@@ -47,12 +47,8 @@ def places(outputs: list[TickOutput]) -> list[float | None]:
     return [None if one.decision.target is None else one.decision.target[0] for one in find_boundaries(outputs)]
 
 
-def answers(output: TickOutput) -> list[tuple[str, str]]:
-    return [
-        (event.code, event.text)
-        for event in output.events
-        if event.code in (EventCode.ORDER_ACCEPTED, EventCode.ORDER_REFUSED)
-    ]
+def answers(output: TickOutput) -> list[str]:
+    return [event.code for event in output.events if event.code in (EventCode.ORDER_ACCEPTED, EventCode.ORDER_REFUSED)]
 
 
 def between(first_m: float, second_m: float, hold_ns: int = 0, land: bool = False) -> Controller:
@@ -67,29 +63,18 @@ def test_goto_flies_to_a_place_and_stays_until_the_mission_is_resumed() -> None:
     outputs = run(between(1.0, 2.0), make_inputs(range(6 * TICKS), make_step_samples(), commands=commands))
     assert places(outputs) == [1.0, 1.0, 3.0, 3.0, 1.0, 1.0]
     assert [one.decision.waypoint for one in find_boundaries(outputs)] == [0, 0, None, None, 0, 0]
-    assert outputs[2 * TICKS].decision.reason == "news: a new plan, as ordered: goto (3, 9, 9) m"
-    assert outputs[4 * TICKS].decision.reason == "news: a new plan, as ordered: resume"
-    assert answers(outputs[6]) == [
-        (EventCode.ORDER_ACCEPTED, "goto (3, 9, 9) m")
-    ]  # axes that the plant has not are ignored
+    assert answers(outputs[6]) == [EventCode.ORDER_ACCEPTED]  # axes that the plant has not are ignored
     assert set(list_modes(outputs)) == {TRACK}
 
 
 @pytest.mark.parametrize(
-    ("position_m", "reason"),
-    [
-        ((5.001, 0.0, 0.0), "goto (5.001, 0, 0) m: north 5.001 m is outside [-5.00, 5.00] m, where it may rest"),
-        ((-7.0, 0.0, 0.0), "goto (-7, 0, 0) m: north -7 m is outside [-5.00, 5.00] m, where it may rest"),
-        ((math.nan, 0.0, 0.0), "goto (nan, 0, 0) m: the place is not finite"),
-        ((0.0, 0.0, math.inf), "goto (0, 0, inf) m: the place is not finite"),
-        (None, "goto: there is no place to go to"),
-    ],
+    "position_m", [(5.001, 0.0, 0.0), (-7.0, 0.0, 0.0), (math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), None]
 )
-def test_a_place_where_it_may_not_rest_is_refused_and_the_mission_goes_on(position_m: Vec3 | None, reason: str) -> None:
+def test_a_place_where_it_may_not_rest_is_refused_and_the_mission_goes_on(position_m: Vec3 | None) -> None:
     plain = run(between(1.0, 2.0), make_inputs(range(4 * TICKS), make_step_samples()))
     commands = {6: (Command(order=Order.GOTO, position_m=position_m),)}
     outputs = run(between(1.0, 2.0), make_inputs(range(4 * TICKS), make_step_samples(), commands=commands))
-    assert answers(outputs[6]) == [(EventCode.ORDER_REFUSED, reason)]
+    assert answers(outputs[6]) == [EventCode.ORDER_REFUSED]
     assert outputs[6].events[0].severity is Severity.WARNING
     assert [one.decision for one in outputs] == [one.decision for one in plain]
     assert [one.setpoint for one in outputs] == [one.setpoint for one in plain]
@@ -122,11 +107,7 @@ def test_hold_stays_where_the_vehicle_comes_to_rest_inside_the_box() -> None:
 def test_the_last_of_several_orders_counts_and_each_is_answered() -> None:
     commands = {5: (goto(1.0, 0, 0), goto(9.0, 0, 0), goto(2.0, 0, 0)), 6: (ENGAGE,), 7: (goto(3.0, 0, 0),)}
     outputs = run(between(0.5, 0.6), make_inputs(range(3 * TICKS), make_step_samples(), commands=commands))
-    assert [code for code, _ in answers(outputs[5])] == [
-        EventCode.ORDER_ACCEPTED,
-        EventCode.ORDER_REFUSED,
-        EventCode.ORDER_ACCEPTED,
-    ]
+    assert answers(outputs[5]) == [EventCode.ORDER_ACCEPTED, EventCode.ORDER_REFUSED, EventCode.ORDER_ACCEPTED]
     assert answers(outputs[6]) == []
     assert places(outputs) == [0.5, 0.5, 3.0]
 
@@ -170,14 +151,14 @@ def test_a_waypoint_left_half_way_is_held_for_its_whole_time_afterwards() -> Non
 @pytest.mark.parametrize(("commands", "tick"), [({3: (RESUME,)}, 3), ({3: (STAY,), 8: (RESUME,), 13: (RESUME,)}, 13)])
 def test_what_was_not_left_is_not_resumed(commands: dict[int, tuple[Command, ...]], tick: int) -> None:
     outputs = run(between(1.0, 2.0), make_inputs(range(5 * TICKS), make_step_samples(), commands=commands))
-    assert answers(outputs[tick]) == [(EventCode.ORDER_REFUSED, "resume: the mission was not left")]
+    assert answers(outputs[tick]) == [EventCode.ORDER_REFUSED]
 
 
 @pytest.mark.parametrize("configured", [True, False])
 def test_land_brakes_and_lands_whatever_the_fallback_is_configured_to(configured: bool) -> None:
     samples = make_motion_samples(49)
     outputs = run(make_controller(land=configured), make_inputs(range(100), samples, commands={10: (DOWN,)}))
-    assert answers(outputs[10]) == [(EventCode.ORDER_ACCEPTED, "land")]
+    assert answers(outputs[10]) == [EventCode.ORDER_ACCEPTED]
     ends = list_modes(outputs).index(LAND)
     assert list_modes(outputs) == [TRACK] * 10 + [BRAKE] * (ends - 11) + [HOLD, LAND] + [STOPPED] * (99 - ends)
     assert 11 < ends <= 52  # brake_s = 2 s
@@ -189,28 +170,17 @@ def test_land_brakes_and_lands_whatever_the_fallback_is_configured_to(configured
 def test_on_the_way_down_other_orders_are_refused() -> None:
     commands = {10: (DOWN,), 11: (goto(1.0, 0, 0), STAY), 12: (RESUME,), 90: (DOWN,)}
     outputs = run(make_controller(), make_inputs(range(100), make_motion_samples(49), commands=commands))
-    assert [text for _, text in answers(outputs[11])] == [
-        "goto (1, 0, 0) m: the vehicle is on its way down",
-        "hold: the vehicle is on its way down",
-    ]
-    assert answers(outputs[12])[0][0] == EventCode.ORDER_REFUSED
-    assert answers(outputs[90]) == [(EventCode.ORDER_REFUSED, "land: the vehicle has been handed over")]
+    assert answers(outputs[11]) == [EventCode.ORDER_REFUSED, EventCode.ORDER_REFUSED]
+    assert answers(outputs[12]) == answers(outputs[90]) == [EventCode.ORDER_REFUSED]
     assert STOPPED in list_modes(outputs)
 
 
-@pytest.mark.parametrize(
-    ("status", "reason"),
-    [
-        (None, "land: no vehicle is heard"),
-        (vehicle(armed=False), "land: the vehicle is not armed"),
-        (vehicle(external=False), "land: the vehicle is in mode OFFBOARD, which takes no setpoints"),
-    ],
-)
-def test_what_is_not_flown_is_not_landed(status: VehicleStatus | None, reason: str) -> None:
+@pytest.mark.parametrize("status", [None, vehicle(armed=False), vehicle(external=False)])
+def test_what_is_not_flown_is_not_landed(status: VehicleStatus | None) -> None:
     outputs = run(
         make_controller(), make_inputs(range(8), make_step_samples(), commands={4: (DOWN,)}, status=lambda _: status)
     )
-    assert answers(outputs[4]) == [(EventCode.ORDER_REFUSED, reason)]
+    assert answers(outputs[4]) == [EventCode.ORDER_REFUSED]
     assert set(list_modes(outputs)) == {WAIT}
 
 
@@ -223,7 +193,7 @@ def test_a_landing_ordered_while_the_vehicle_is_silent_waits_until_it_is_heard()
         status=lambda tick: None if tick in silent else vehicle(),
     )
     outputs = run(make_controller(land=False), inputs)
-    assert answers(outputs[20]) == [(EventCode.ORDER_ACCEPTED, "land")]
+    assert answers(outputs[20]) == [EventCode.ORDER_ACCEPTED]
     assert list_modes(outputs).index(LAND) == 60
     muted = [tick for tick, one in enumerate(outputs) if one.setpoint is None]
     assert muted == list(range(muted[0], 70))  # from where landing was due on
@@ -245,7 +215,6 @@ def test_a_mission_may_end_in_landing_after_the_last_waypoint_s_time() -> None:
     outputs = run(controller, make_inputs(range(9 * TICKS), make_step_samples()))
     # Arrives at once, two steps there; then a step to the next, which is as near, and two steps there.
     lands = 5 * TICKS
-    assert outputs[lands].decision.reason == "the mission is over: landing"
     assert list_modes(outputs)[:lands] == [TRACK] * lands
     assert list_modes(outputs).index(LAND) == list_modes(outputs).index(HOLD) + 1
     assert list_modes(outputs)[-1] is STOPPED
@@ -266,11 +235,7 @@ def test_a_plant_that_cannot_rest_everywhere_is_not_sent_anywhere() -> None:
     controller = replace(controller, mission=replace(controller.mission, room=None))
     commands = {3: (goto(1.0, 0, 0), STAY)}
     outputs = run(controller, make_inputs(range(2 * TICKS), make_step_samples(), commands=commands))
-    reason = "there are places where this plant cannot rest"
-    assert answers(outputs[3]) == [
-        (EventCode.ORDER_REFUSED, f"goto (1, 0, 0) m: {reason}"),
-        (EventCode.ORDER_REFUSED, f"hold: {reason}"),
-    ]
+    assert answers(outputs[3]) == [EventCode.ORDER_REFUSED, EventCode.ORDER_REFUSED]
 
 
 def test_orders_and_their_answers_are_replayed_bit_for_bit() -> None:

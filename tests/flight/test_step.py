@@ -71,21 +71,13 @@ def test_nothing_is_sent_before_the_first_position() -> None:
         assert (output.setpoint, output.estimate, decision.input, decision.age_steps) == (None, None, None, None)
 
 
-@pytest.mark.parametrize(
-    ("status", "reason"),
-    [
-        (None, "no vehicle is heard"),
-        (vehicle(armed=False), "the vehicle is not armed"),
-        (vehicle(external=False), "the vehicle is in mode OFFBOARD, which takes no setpoints"),
-    ],
-)
-def test_a_vehicle_that_takes_no_setpoints_gets_a_neutral_stream(status: VehicleStatus | None, reason: str) -> None:
+@pytest.mark.parametrize("status", [None, vehicle(armed=False), vehicle(external=False)])
+def test_a_vehicle_that_takes_no_setpoints_gets_a_neutral_stream(status: VehicleStatus | None) -> None:
     solver = StubSolver(small_plant())
     outputs = run(
         make_controller(solver), make_inputs(range(3 * TICKS), make_step_samples(), status=lambda tick: status)
     )
     assert list_modes(outputs) == [WAIT] * 3 * TICKS
-    assert {output.decision.reason for output in outputs} == {reason}
     for output in outputs:
         assert output.setpoint is not None
         assert (output.setpoint.accel_mps2, output.setpoint.source) == ((0.0, 0.0, 0.0), SetpointSource.HOLD)
@@ -100,7 +92,6 @@ def test_engages_at_a_boundary_and_lets_go_at_once() -> None:
     )
     want = [WAIT] * TICKS + [TRACK] * (TICKS + 1) + [WAIT] * (TICKS - 1)
     assert list_modes(outputs) == want
-    assert outputs[2].decision.reason == "waits for the next boundary"
     assert [event.code for event in outputs[2 * TICKS + 1].events] == ["disengaged"]
 
 
@@ -128,7 +119,6 @@ def test_a_flight_may_begin_between_boundaries() -> None:
     samples = [sample(START_NS + first * TICK_NS - 10 * MS), *make_step_samples()]
     outputs = run(make_controller(), make_inputs(range(first, first + TICKS), [samples[0], *samples[7:]]))
     assert list_modes(outputs) == [WAIT] * (TICKS - 1) + [TRACK]
-    assert outputs[0].decision.reason.startswith("no position")
 
 
 def test_the_estimator_knows_the_input_after_the_last_gate() -> None:

@@ -12,7 +12,17 @@ from msgspec.structs import replace
 from uavctl.flight.estimator import absorb_samples, begin_history, note_input
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.monitors.outliers import GateParameters
-from uavctl.flight.monitors.stale import MovedNs, SourceRecord, SourceRecords, is_doubtful, is_stuck, record_sample
+from uavctl.flight.monitors.stale import (
+    MovedNs,
+    SourceRecord,
+    SourceRecords,
+    StaleObservation,
+    is_doubtful,
+    is_stuck,
+    record_sample,
+    update,
+)
+from uavctl.flight.monitors.verdict import Cause
 from uavctl.records import PositionSample
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
@@ -46,19 +56,6 @@ def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_
     assert (watch.repeats, watch.coasting) == (0, None)
     assert watched([0.0])["camera"].resolution_m == 0.0
     assert watched([0.0, 3.0])["camera"].resolution_m == 3.0
-
-
-def test_a_position_that_is_no_triple_is_an_error_and_not_compared_in_part() -> None:
-    short = sample(START_NS + 9 * TICK_NS, position_m=(0.0, 0.5))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="zip"):
-        record_sample(watched([0.0]), KALMAN, begin_history(KALMAN, START_NS, START_NS), short, np.zeros(1))
-
-
-def test_what_is_known_of_a_source_is_one_object_that_nobody_changes() -> None:
-    watch = watched([0.0, 0.5, 0.5])["camera"]
-    with pytest.raises(AttributeError):
-        watch.is_known_stuck = True  # type: ignore[misc]
-    assert watch != replace(watch)  # and not compared by its arrays, which have no one truth
 
 
 def test_coasting_goes_by_the_inputs_alone() -> None:
@@ -326,14 +323,6 @@ def test_a_source_that_says_values_twice_is_not_stuck_for_it_however_far_the_veh
     assert is_stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS, ALWAYS) is True
 
 
-def test_nothing_is_known_of_a_source_at_first() -> None:
-    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0))
-    assert (watch.resolution_m, watch.noise_m, watch.changes, watch.first_ns, watch.repeats) == (0.0, 0.0, 0, 0, 0)
-    assert (watch.moves, watch.still, watch.still_ns) == ((0, 0, 0),) * 3
-    assert (watch.usual, watch.gap_ns, watch.spacing_ns) == (0.0, 0, 0)
-    assert not (watch.is_doubted or watch.is_known_stuck or watch.coasting)
-
-
 def test_news_is_a_mean_of_which_the_first_values_are_equal_parts() -> None:
     watches, history = watched([0.0]), begin_history(KALMAN, START_NS, START_NS)
     means = []
@@ -392,3 +381,49 @@ def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_to
     assert watch.coasting is not None
     assert watch.coasting.at_ns == late_ns
     assert is_doubtful(watch, KALMAN, late, PARAMETERS)
+
+
+def judged(
+    inputs_mps2: list[float], *, is_flying: bool = True, late_ns: int = 0, next_m: float = 0.02
+) -> list[tuple[Cause | None, float]]:
+    """Verdicts on a value that comes again with each input, and the position that inputs alone predict [m].
+
+    Args:
+        late_ns: Time by which the last sample comes late [ns].
+        next_m: Value of the last sample.
+    """
+    values = [0.0, 0.01, *[0.02] * len(inputs_mps2), next_m]
+    records: SourceRecords = {}
+    history, found = begin_history(KALMAN, START_NS, START_NS), []
+    for n, (value, accel_mps2) in enumerate(zip(values, [0.0, 0.0, 0.0, *inputs_mps2], strict=True)):
+        at_ns = START_NS + (n + 1) * TICK_NS
+        captured_ns = at_ns - late_ns if n == len(values) - 1 else at_ns
+        one = sample(captured_ns, at_ns, position_m=(value, 0.0, 0.0))
+        history, _, _ = absorb_samples(KALMAN, history, at_ns, ())
+        observation = StaleObservation(one, np.array([0.001]), KALMAN, history, is_flying, ALWAYS, PARAMETERS)
+        records, verdict = update(records, observation)
+        if verdict.is_none:
+            history, _, _ = absorb_samples(KALMAN, history, at_ns, (one,))
+        history = note_input(KALMAN, history, at_ns, np.array([accel_mps2]))
+        coasting = records["camera"].coasting
+        found.append((verdict.cause, math.nan if coasting is None else float(coasting.mean[0])))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("inputs_mps2", "within_m", "cause"),
+    [([4.0] * 2 + [-4.0] * 12, 0.015, Cause.REPEATED), ([4.0] * 8 + [-4.0] * 25, 0.1, Cause.FROZEN)],
+)
+def test_a_source_that_was_found_out_is_not_believed_though_inputs_come_back_to_its_value(
+    inputs_mps2: list[float], within_m: float, cause: Cause
+) -> None:
+    last, predicted_m = judged(inputs_mps2)[-1]
+    assert predicted_m == pytest.approx(0.02, abs=within_m)  # so near that this repeat alone is no reason
+    assert last == cause
+    assert judged(inputs_mps2, next_m=0.03)[-1][0] is None
+
+
+def test_a_vehicle_on_the_ground_may_repeat_its_value_and_a_late_sample_says_nothing() -> None:
+    assert {cause for cause, _ in judged([4.0] * 20, is_flying=False)} == {None}
+    assert judged([4.0] * 20)[-1][0] == Cause.FROZEN
+    assert judged([4.0] * 20, late_ns=TICK_NS + MS)[-1][0] is None
