@@ -49,7 +49,7 @@ from uavctl.records import Vec3, VehicleMotion
 def test_velocities_are_compared_over_three_positions_and_part_of_the_window(
     spans_ns: tuple[int, ...], compared: bool
 ) -> None:
-    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
+    watching, _ = look(ZERO, vehicle_motion=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
     assert watching.velocity.apart_mps == (pytest.approx(0.125) if compared else None)
     assert watching.velocity.apart_ns is None
     assert not watching.velocity.is_contradicted
@@ -65,7 +65,7 @@ def turning(accel: Vec3, slope: Vec3) -> tuple[float | None, bool]:
     nodes_ns = (times_ns[0] - 1, *times_ns, AT_NS - 1)
     way = tuple((at, 0.5 * ((at - AT_NS) * 1e-9) ** 2 * np.array(accel)) for at in nodes_ns)
     lines = tuple((at, (at - AT_NS) * 1e-9 * np.array(slope)) for at in times_ns)
-    watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
+    watching, _ = look(ZERO, vehicle_motion=AT_REST, vehicle_path=way, offsets=lines)
     return watching.velocity.apart_mps, watching.velocity.is_contradicted
 
 
@@ -95,7 +95,7 @@ def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
         way = tuple(
             (at, np.array([((at - AT_NS) * 1e-9) ** 2, 0.0, 0.0])) for at in (begins_ns - 1, times_ns[1], AT_NS - 1)
         )
-        watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
+        watching, _ = look(ZERO, vehicle_motion=AT_REST, vehicle_path=way, offsets=lines)
         assert watching.velocity.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
 
 
@@ -141,7 +141,7 @@ def test_a_velocity_that_is_contradicted_is_not_agreed_with() -> None:
 def test_a_contradiction_counts_from_a_window_after_the_first_second_of_positions_on() -> None:
     since_ns = AT_NS - PARAMETERS.window_ns - SECOND_NS
     for resumed_ns, counts in ((since_ns, True), (since_ns + 1, False)):
-        watching, _ = look(ZERO, own=AT_REST, resumed_ns=resumed_ns, **offsets(0.3))
+        watching, _ = look(ZERO, vehicle_motion=AT_REST, resumed_ns=resumed_ns, **offsets(0.3))
         assert watching.velocity.is_contradicted and (watching.velocity.apart_ns is not None) == counts
 
 
@@ -166,7 +166,7 @@ def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorStat
     middle_ns = AT_NS - 256 * MS
     older = tuple((middle_ns - age_ns - n * SECOND_NS, np.zeros(3)) for n in range(before, 0, -1))
     places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
-    return look(ZERO, own=AT_REST, places=places, **known)
+    return look(ZERO, vehicle_motion=AT_REST, places=places, **known)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
 
 
 def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
-    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
+    watching, _ = look(ZERO, vehicle_motion=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
     ((at_ns, place),) = watching.velocity.places
     assert at_ns == AT_NS - 200 * MS
     np.testing.assert_allclose(place, (-0.125 * 0.2, 0.0, 0.0), atol=1e-12)
@@ -227,11 +227,13 @@ def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
 def test_over_a_gap_the_way_is_not_compared() -> None:
     places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
     for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
-        watching, breach = look(ZERO, own=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
+        watching, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
         assert breach is None
         assert watching.velocity.places == (places if kept else ())
     silent, _ = look(ZERO, places=places, **offsets(0.0))
-    missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),)))
+    missed, _ = look(
+        ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),))
+    )
     assert silent.velocity.places == missed.velocity.places == ()
     state = monitors(vehicle_path=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
     early, _ = update(state, seen(AT_NS, sample(START_NS, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
@@ -240,15 +242,15 @@ def test_over_a_gap_the_way_is_not_compared() -> None:
 
 def test_a_contradiction_is_reported_before_scatter_and_after_an_unexplained_acceleration() -> None:
     contradicts = offsets(9.0)
-    _, scattered = look(ZERO, off_m=9.0, own=AT_REST, clipped=(True, True), **contradicts)
+    _, scattered = look(ZERO, off_m=9.0, vehicle_motion=AT_REST, clipped=(True, True), **contradicts)
     assert scattered is not None and scattered.cause == Cause.VELOCITY
-    _, unexplained = look((9.0, 0.0, 0.0), own=AT_REST, **contradicts)
+    _, unexplained = look((9.0, 0.0, 0.0), vehicle_motion=AT_REST, **contradicts)
     assert unexplained is not None and unexplained.cause == Cause.RESPONSE
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
     places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
-    _, breach = look(ZERO, own=AT_REST, places=places, **offsets(9.0))
+    _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(9.0))
     assert breach is not None and breach.text.startswith("positions move otherwise")
 
 
@@ -288,7 +290,7 @@ def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plai
     s = LOOK_NS * 1e-9
     place = s * -(s * unexplained_mps2) + 0.5 * s * s * unexplained_mps2
     known = offsets(EXACT_MPS, place_m=place, apart_ns=apart_ns)
-    watching, breach = look((unexplained_mps2, 0.0, 0.0), own=AT_REST, parameters=parameters, **known)
+    watching, breach = look((unexplained_mps2, 0.0, 0.0), vehicle_motion=AT_REST, parameters=parameters, **known)
     assert watching.velocity.apart_mps == EXACT_MPS
     assert watching.velocity.apart_ns == since_ns
     assert watching.velocity.is_contradicted == (since_ns is not None)
@@ -329,7 +331,7 @@ def test_the_way_is_remembered_for_three_seconds() -> None:
     ],
 )
 def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotion | None, known: bool) -> None:
-    watching, _ = look(ZERO, own=words, **offsets(0.125))
+    watching, _ = look(ZERO, vehicle_motion=words, **offsets(0.125))
     assert (watching.velocity.apart_mps is not None) == (len(watching.velocity.offsets) == 3) == known
     assert len(watching.motion.vehicle_path) == (3 if known else 0)
     ours = structs.replace(seen(AT_NS, vehicle_motion=words), velocity_mps=ZERO)
@@ -339,7 +341,7 @@ def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotio
 @pytest.mark.parametrize(("gap_ns", "known"), [(300 * MS, True), (300 * MS + 1, False)])
 def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, known: bool) -> None:
     before = offsets(0.0, vehicle_path=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
-    watching, _ = look(ZERO, own=motion((1.0, 0.0, 0.0), AT_NS), **before)
+    watching, _ = look(ZERO, vehicle_motion=motion((1.0, 0.0, 0.0), AT_NS), **before)
     assert watching.motion.vehicle_path[-1][0] == AT_NS
     assert watching.motion.vehicle_path[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
     assert [at for at, _ in watching.motion.vehicle_path[:-1]] == [AT_NS - gap_ns] * known
