@@ -126,23 +126,27 @@ def _follow_setpoints(
     observer: Observer, sent: tuple[tuple[int, Vec3], ...], at_ns: int, lag_s: Vec3
 ) -> tuple[Array, Array, Array]:
     """Compute position, velocity and acceleration (3,) at a time, by the setpoints behind the vehicle's lag."""
-    lags_s = np.maximum(lag_s, LEAST_LAG_S)
-    (position, velocity, unexplained), accel = observer.mean, observer.accel_mps2
+    lags_s = [max(lag, LEAST_LAG_S) for lag in lag_s]
+    position, velocity, unexplained = observer.mean.tolist()
+    accel: list[float] = observer.accel_mps2.tolist()
     first = bisect_right(sent, observer.at_ns, key=_TIME)
     last = bisect_left(sent, at_ns, lo=first, key=_TIME)
     acting = sent[first - 1][1] if first else ZERO
     for begin_ns, end_ns, setpoint in _split_spans(observer.at_ns, at_ns, acting, sent[first:last]):
         if end_ns <= begin_ns:
             continue
-        s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
-        # τ a' = u - a: a = u + (a_0 - u) e^(-s/τ), and ∫ (a - u) = (a_0 - u) τ (1 - e^(-s/τ))
-        remaining = np.exp(-s / lags_s)
-        lagging = (accel - u) * lags_s * (1.0 - remaining)
-        # p = p + s v + ½ s² (u + d) + τ ((a_0 - u) s - ∫ (a - u)); v = v + s (u + d) + ∫ (a - u)
-        position = position + s * velocity + 0.5 * s * s * (u + unexplained) + lags_s * ((accel - u) * s - lagging)
-        velocity = velocity + s * (u + unexplained) + lagging
-        accel = u + (accel - u) * remaining
-    return position, velocity, accel
+        s = (end_ns - begin_ns) * 1e-9
+        # e^(-s/τ); numpy's exponential, as recordings were made with it
+        decay = np.exp([-s / lag for lag in lags_s]).tolist()
+        for i, (u, d, lag, remaining) in enumerate(zip(setpoint, unexplained, lags_s, decay, strict=True)):
+            # τ a' = u - a: a = u + (a_0 - u) e^(-s/τ), and ∫ (a - u) = (a_0 - u) τ (1 - e^(-s/τ))
+            above = accel[i] - u
+            lagging = above * lag * (1.0 - remaining)
+            # p = p + s v + ½ s² (u + d) + τ ((a_0 - u) s - ∫ (a - u)); v = v + s (u + d) + ∫ (a - u)
+            position[i] = position[i] + s * velocity[i] + 0.5 * s * s * (u + d) + lag * (above * s - lagging)
+            velocity[i] = velocity[i] + s * (u + d) + lagging
+            accel[i] = u + above * remaining
+    return np.array(position), np.array(velocity), np.array(accel)
 
 
 def _split_spans(
