@@ -214,7 +214,7 @@ def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() ->
     whole: tuple[InertialSpan, ...] = ()
     short: tuple[InertialSpan, ...] = ()
     for n in range(200):
-        at_ns, accel = START_NS + n * TICK_NS, rng.normal(size=3)
+        at_ns, accel = START_NS + n * TICK_NS, rng.normal(size=3).tolist()
         whole, short = extend_path(whole, at_ns, accel, 0), extend_path(short, at_ns, accel, at_ns - SECOND_NS)
     assert len(whole) == 200 and len(short) == SECOND_NS // TICK_NS + 1
     mean = rng.normal(size=(3, 3))

@@ -28,7 +28,7 @@ from uavctl.flight.kalman import (
     update_with_inertial,
     update_with_position,
 )
-from uavctl.records import Estimate, InertialSample, PositionSample
+from uavctl.records import Estimate, InertialSample, PositionSample, Vec3
 
 DUPLICATE = "sample-duplicate"
 TOO_OLD = "sample-too-old"
@@ -175,8 +175,8 @@ def update_inertial(kalman: Kalman, history: FilterHistory, samples: Sequence[In
     at_ns = sum(one.at_ns for one in readings) // len(readings)
     if at_ns <= history.horizon_ns:
         return history
-    # ā = Σ a_i / n
-    accel = np.add.reduce([one.accel_mps2 for one in readings], axis=0)[list(kalman.axes)] / len(readings)
+    mean = average_vectors([one.accel_mps2 for one in readings])
+    accel = np.array([mean[axis] for axis in kalman.axes])
     key = (at_ns, _INERTIAL, "", at_ns)
     new = FilterEvent(key=key, sample=None, input=None, after=history.anchor, accel_mps2=accel)
     return _insert(kalman, history, new, None)
@@ -196,6 +196,14 @@ def distrust_inertial(kalman: Kalman, history: FilterHistory, at_ns: int) -> Fil
         key=(at_ns, _MARK, "doubted", at_ns), sample=None, input=None, after=node, distrusts_inertial=True
     )
     return _insert(kalman, history, mark, None)
+
+
+def average_vectors(vectors: Sequence[Vec3]) -> Vec3:
+    """Return the mean of vectors, at least one."""
+    n = len(vectors)
+    # ā = Σ a_i / n
+    north, east, down = (sum(values) / n for values in zip(*vectors, strict=True))
+    return north, east, down
 
 
 def _is_new_reading(sample: InertialSample, before: InertialSample | None) -> bool:
@@ -288,13 +296,16 @@ def estimate_at(kalman: Kalman, history: FilterHistory, at_ns: int) -> Estimate 
 
 def make_estimate(kalman: Kalman, belief: Belief, *, with_cov: bool = True) -> Estimate:
     """Make the estimate that leaves the filter from a belief, biases within their bounds."""
-    bias, largest = kalman.bias, kalman.bias_limits
+    bias = kalman.bias
     return Estimate(
         at_ns=belief.at_ns,
         captured_ns=belief.captured_ns,
         mean=tuple(belief.mean[: bias.start].tolist()),
         cov=tuple(map(tuple, belief.cov[: bias.start, : bias.start].tolist())) if with_cov else (),
-        bias=tuple(belief.mean[bias].clip(-largest, largest).tolist()),
+        # d within ±d_max
+        bias=tuple(
+            min(max(d, -bound), bound) for d, bound in zip(belief.mean[bias].tolist(), kalman.bias_bounds, strict=True)
+        ),
     )
 
 

@@ -91,7 +91,7 @@ def report_events(
         *_report_link(link_alarms, before.link_alarms, link),
         *_report_inertial(before.inertial, inertial, at_ns),
     )
-    if bias:
+    if inputs_at_bound != before.inputs_at_bound:
         push_mps2 = context.controller.plant.to_accel(np.array(bias))
         events += report_bias(push_mps2, before.inputs_at_bound, inputs_at_bound, at_ns)
     events += _report_push(state.monitors.engaged, supervised.monitors.engaged, context)

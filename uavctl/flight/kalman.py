@@ -79,13 +79,11 @@ class Kalman:
     identity: Array  # of the size of z
     # Largest bias that is flown against, of each input that has one [input units]; made from the others
     bias_bounds: tuple[float, ...] = field(init=False)
-    bias_limits: Array = field(init=False, repr=False)  # the same
     bias: slice = field(init=False)  # slice of the biases among the states; made from the others
 
     def __post_init__(self) -> None:
         bounds = (self.parameters.bias_bounds or (self.parameters.bias_max,) * self.n_bias)[: self.n_bias]
         object.__setattr__(self, "bias_bounds", bounds)
-        object.__setattr__(self, "bias_limits", np.array(bounds))
         object.__setattr__(self, "bias", slice(self.n_x - self.n_inertial - self.n_bias, self.n_x - self.n_inertial))
 
 
@@ -328,7 +326,7 @@ def update_with_inertial(kalman: Kalman, belief: Belief, accel_mps2: Array, u: A
     # S = M_z P M_z' + R
     ph = cov.dot(of_z.T)
     spread = of_z.dot(ph) + noise
-    plausible = inertial.is_plausible(innovation, np.diagonal(spread))
+    plausible = inertial.is_plausible(innovation.tolist(), spread.diagonal().tolist())
     observation = InertialObservation(Source.MODEL, plausible, belief.at_ns, belief.captured_ns)
     trust, _ = inertial.update(belief.inertial, observation)
     if not plausible:

@@ -53,4 +53,6 @@ def limit_setpoint(
 
 
 def _clamp(value: float, lower: float, upper: float) -> float:
-    return min(max(value, lower), upper)
+    if value < lower:
+        return lower
+    return upper if value > upper else value

@@ -80,9 +80,9 @@ def estimate_link(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns:
     independent ones, by (1 - r) / (1 + r) with r the correlation of a step with the next (the variance of the mean
     of a two-state chain).
     """
-    statistic = compute_burst_statistic(belief)
+    statistic, correlation = compute_burst_statistic(belief), _correlation(belief)
     bursts = statistic > -float(ndtri(parameters.false_alarm))
-    share = (1.0 - _correlation(belief)) / (1.0 + _correlation(belief)) if bursts else 1.0
+    share = (1.0 - correlation) / (1.0 + correlation) if bursts else 1.0
     arrived, lost = share * belief.arrived, share * belief.lost
     return LinkEstimate(
         at_ns=at_ns,

@@ -23,6 +23,7 @@ from uavctl.flight.estimator import (
     FilterHistory,
     PendingInputs,
     apply_due_inputs,
+    average_vectors,
     begin_history,
     drop_samples,
     find_newest_capture_ns,
@@ -291,13 +292,8 @@ def _read_inertial(before: InertialReading | None, inputs: StepInput) -> Inertia
     """Return the mean inertial data of a tick, else the last ones; None where those are too old, or none came."""
     accels = [one.accel_mps2 for one in inputs.inertial if all(map(math.isfinite, one.accel_mps2))]
     if accels:
-        return InertialReading(_average(accels), inputs.at_ns)
+        return InertialReading(average_vectors(accels), inputs.at_ns)
     return before if before is not None and inputs.at_ns - before.at_ns <= MOTION_NS else None
-
-
-def _average(vectors: Sequence[Vec3]) -> Vec3:
-    north, east, down = (sum(values) / len(vectors) for values in zip(*vectors, strict=True))
-    return north, east, down
 
 
 def find_refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters) -> str | None:

@@ -72,6 +72,7 @@ class Room:
 
     def stopped(self, state: Vector) -> Vector:
         """The equilibrium (n_x,) that a state is braked to, inside the limits."""
+        # p = S x, within the places to rest at
         return self._equilibrium(np.clip(self.stop @ np.array(state), self.lower, self.upper))
 
     def first(self, state: Vector, target: Vector) -> Vector | None:
@@ -94,6 +95,7 @@ class Room:
         return self._equilibrium(ends)
 
     def _equilibrium(self, places: Array) -> Vector:
+        # x = X' p
         return tuple((places @ self.rest).tolist())
 
 
@@ -213,6 +215,7 @@ def find_target(mission: Mission, state: MissionState, at_ns: int) -> Vector:
     row, into_ns = divmod(since_ns, mission.dt_ns)
     if row + 1 >= len(states):
         return tuple(states[-1].tolist())
+    # x = (1 - λ) x_k + λ x_k+1
     part = into_ns / mission.dt_ns
     return tuple(((1.0 - part) * states[row] + part * states[row + 1]).tolist() if part else states[row].tolist())
 
@@ -245,6 +248,7 @@ def _limits(mission: Mission, since_ns: int) -> Array | None:
     times_ns = since_ns + mission.dt_ns * np.arange(mission.horizon + 1, dtype=np.float64)
     limits = np.tile(mission.limits, (mission.horizon + 1, 1))
     for fence in mission.fences:
+        # h_k = min(h, fence(t + k Δt))
         moving = np.interp(times_ns, fence.times_ns, fence.values)
         limits[:, fence.row] = np.minimum(limits[:, fence.row], moving)
     return None if bool((limits == mission.limits).all()) else limits

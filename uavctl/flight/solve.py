@@ -91,6 +91,4 @@ def _make_row(values: Array) -> Vector:
 
 
 def _make_rows(values: Array) -> Matrix:
-    if len(values) and not np.count_nonzero(values) and not np.signbit(values).any():
-        return (tuple(values[0].tolist()),) * len(values)  # back-offs of the inputs of an open-loop plan
     return tuple(map(tuple, values.tolist()))

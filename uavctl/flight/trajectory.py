@@ -113,12 +113,15 @@ def plan_along(plant: Plant, motion: PlantMotion, horizon: int, rest: int, lower
     rest_x, rest_u = _equilibria(plant)
     # At rest, wherever that is: the part of x_N that is no equilibrium has to vanish.
     moving, seen = _moving(plant, rest_x), ~_of_loops(plant)
+    # x_brake = x_N - R L (M R) M x_N, with R the reach of N steps and L the least inputs
     braked = states[:, rest] - states[:, rest] @ (reach[rest] @ _least(cost, moving @ reach[rest]) @ moving).T
     places = np.clip(braked[:, list(plant.position_index)], lower, upper)
     anchors, anchor_inputs = places @ rest_x, places @ rest_u
+    # Δu = L(R) (x_anchor - x_N)
     change = (anchors - states[:, rest])[:, seen] @ _least(cost, reach[rest][seen]).T
     path_states, path_inputs = np.zeros((n, horizon, n_x)), np.zeros((n, horizon, n_u))
     for t in range(rest):
+        # x_t = x_t + R_t Δu - x_anchor; u_t = u_t + Δu_t - u_anchor
         path_states[:, t] = states[:, t] + change @ reach[t].T - anchors
         path_inputs[:, t] = inputs[:, t] + change[:, t * n_u : (t + 1) * n_u] - anchor_inputs
     return Trajectory(states=motion.states, anchors=anchors, path_states=path_states, path_inputs=path_inputs)
@@ -135,6 +138,7 @@ def make_room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
     """
     rest_x, _ = _equilibria(plant)
     moving, effect = _moving(plant, rest_x), _reach(plant, rest)[rest]
+    # B = R L(M R) M; x_stop = (I - B) A^N x
     brakes = effect @ _least(np.eye(rest * plant.n_u), moving @ effect) @ moving
     stopped = (np.eye(plant.n_x) - brakes) @ np.linalg.matrix_power(plant.a, rest)
     return Room(
@@ -150,6 +154,7 @@ def _reach(plant: Plant, steps: int) -> Array:
     """Return how inputs u_0 … u_{steps-1} act on the states of stages 0 … steps (steps+1, n_x, steps n_u)."""
     reach = np.zeros((steps + 1, plant.n_x, steps * plant.n_u))
     for t in range(steps):
+        # R_t+1 = A R_t + (0 … B … 0), B in the columns of u_t
         reach[t + 1] = plant.a @ reach[t]
         reach[t + 1, :, t * plant.n_u : (t + 1) * plant.n_u] += plant.b
     return reach
@@ -157,6 +162,7 @@ def _reach(plant: Plant, steps: int) -> Array:
 
 def _least(cost: Array, effect: Array) -> Array:
     """Matrix that gives the cheapest inputs with a wanted effect (in the span of `effect`)."""
+    # L = Q⁻¹ R' (R Q⁻¹ R')⁺
     cheap = np.linalg.solve(cost, effect.T)
     least: Array = cheap @ np.linalg.pinv(effect @ cheap, rcond=1e-10)
     return least
@@ -175,5 +181,6 @@ def _equilibria(plant: Plant) -> tuple[Array, Array]:
     """State (n_axes, n_x) and input (n_axes, n_u) at rest, for each metre of each axis."""
     units = [AXES.index(axis) for axis in plant.axes]
     states = np.array([plant.equilibrium((float(i == 0), float(i == 1), float(i == 2))) for i in units])
+    # x = A x + B u: B u = (I - A) x
     drift = states @ (np.eye(plant.n_x) - plant.a).T
     return states, np.asarray(np.linalg.lstsq(plant.b, drift.T, rcond=None)[0].T)

@@ -32,9 +32,9 @@ def update(state: BrakingState, observation: TickObservation) -> tuple[BrakingSt
     tick, motion = observation.tick, observation.motion
     if state.resumed_ns != motion.resumed_ns:  # positions that come back correct the vehicle's own velocity
         state = BrakingState(resumed_ns=motion.resumed_ns)
-    velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
     if not tick.braking:
         return (state if state.began is None else BrakingState(resumed_ns=state.resumed_ns)), NO_VERDICT
+    velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
     if velocity is None:
         return state, NO_VERDICT
     speed_mps = math.hypot(*velocity)

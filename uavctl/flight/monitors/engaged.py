@@ -94,7 +94,10 @@ def _update_with_position(
 
 
 def _select_first(*verdicts: Verdict) -> Verdict:
-    return next((verdict for verdict in verdicts if not verdict.is_none), NO_VERDICT)
+    for verdict in verdicts:
+        if verdict is not NO_VERDICT and not verdict.is_none:
+            return verdict
+    return NO_VERDICT
 
 
 def continue_unengaged(state: MonitorState, inertial_mps2: Vec3) -> MonitorState:

@@ -13,13 +13,12 @@ positions inconsistent. A take-off often makes one false alarm, from the shock o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum, auto
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
-from uavctl.arrays import Array
 from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Cause, Verdict
 
 # Twenty readings come in a second, so one that is left out for nothing costs next to nothing.
@@ -89,10 +88,10 @@ def _distrust(trust: InertialTrust, at_ns: int) -> tuple[InertialTrust, Verdict]
     return replace(trust, distrusted_ns=at_ns), verdict
 
 
-def is_plausible(innovation: Array, variances: Array) -> bool:
+def is_plausible(innovation: Sequence[float], variances: Sequence[float]) -> bool:
     """Whether no axis of a reading is too far from its prediction."""
     # ν_i² ≤ 3² S_ii
-    return bool((np.square(innovation) <= PLAUSIBLE_SIGMA**2 * variances).all())
+    return all(v * v <= PLAUSIBLE_SIGMA**2 * s for v, s in zip(innovation, variances, strict=True))
 
 
 def is_consistent(chi2: float) -> bool:

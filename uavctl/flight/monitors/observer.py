@@ -32,22 +32,24 @@ POSITION_STD_M = 0.02  # least standard deviation of a position: the gate and ro
 LEAST_LAG_S = 1e-3  # for a plant without a lag
 _BEGIN = attrgetter("at_ns")
 _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
+_IDENTITY = np.eye(3)
 
 
 class InertialSpan(msgspec.Struct, frozen=True, eq=False):
     """A span of constant acceleration, and the gain of all spans before it."""
 
     at_ns: int  # its begin [ns]
-    accel_mps2: Array  # acceleration from then on, local NED (3,)
-    gained_mps: Array  # velocity gained until then (3,)
-    gained_m: Array  # distance gained until then, from rest (3,)
+    accel_mps2: Sequence[float]  # acceleration from then on, local NED (3,)
+    gained_mps: Sequence[float]  # velocity gained until then (3,)
+    gained_m: Sequence[float]  # distance gained until then, from rest (3,)
 
-    def integrate(self, at_ns: int) -> tuple[Array, Array]:
+    def integrate(self, at_ns: int) -> tuple[list[float], list[float]]:
         """Return the velocity [m/s] and distance [m] gained until a moment."""
-        s = (at_ns - self.at_ns) * 1e-9
-        # v = v_0 + s a; p = p_0 + s v_0 + ½ s² a
-        velocity: Array = self.gained_mps + s * self.accel_mps2
-        distance: Array = self.gained_m + s * (self.gained_mps + 0.5 * s * self.accel_mps2)
+        s, rows = (at_ns - self.at_ns) * 1e-9, (self.gained_mps, self.gained_m, self.accel_mps2)
+        half_s = 0.5 * s
+        # v = v_0 + s a; p = p_0 + s (v_0 + ½ s a)
+        velocity = [v + s * a for v, a in zip(self.gained_mps, self.accel_mps2, strict=True)]
+        distance = [p + s * (v + half_s * a) for v, p, a in zip(*rows, strict=True)]
         return velocity, distance
 
 
@@ -65,31 +67,24 @@ class Observer(msgspec.Struct, frozen=True, eq=False):
     inertial: Array | None = None
 
 
-def extend_path(
-    path: InertialPath, begin_ns: int, accel_mps2: Sequence[float] | Array, horizon_ns: int
-) -> InertialPath:
+def extend_path(path: InertialPath, begin_ns: int, accel_mps2: Sequence[float], horizon_ns: int) -> InertialPath:
     """Add a span to a path, and drop those that ended before the horizon."""
-    accel = np.array(accel_mps2, dtype=np.float64)
     if not path:
-        return (InertialSpan(begin_ns, accel, np.zeros(3), np.zeros(3)),)
+        return (InertialSpan(begin_ns, accel_mps2, ZERO, ZERO),)
     velocity, gained_m = path[-1].integrate(begin_ns)
     first = max(bisect_right(path, horizon_ns, key=_BEGIN) - 1, 0)
-    return (*path[first:], InertialSpan(begin_ns, accel, velocity, gained_m))
+    return (*path[first:], InertialSpan(begin_ns, accel_mps2, velocity, gained_m))
 
 
 def move_along(path: InertialPath, mean: Array, begin_ns: int, end_ns: int) -> Array:
     """Move position, velocity and unexplained acceleration (3, 3), a row each, along a path that is not empty."""
     (begin_mps, begin_m), (end_mps, end_m) = (_find_span(path, at_ns).integrate(at_ns) for at_ns in (begin_ns, end_ns))
     s = (end_ns - begin_ns) * 1e-9
-    position, velocity, unexplained = mean
-    # p = p + s v + ½ s² d + ∫∫ a; v = v + s d + ∫ a; d = d
-    return np.array(
-        [
-            position + s * (velocity + 0.5 * s * unexplained) + (end_m - begin_m - s * begin_mps),
-            velocity + s * unexplained + (end_mps - begin_mps),
-            unexplained,
-        ]
-    )
+    half_s, moved = 0.5 * s, []
+    for (p, v, d), v_0, p_0, v_1, p_1 in zip(mean.T.tolist(), begin_mps, begin_m, end_mps, end_m, strict=True):
+        # p = p + s v + ½ s² d + ∫∫ a; v = v + s d + ∫ a; d = d
+        moved.append((p + s * (v + half_s * d) + (p_1 - p_0 - s * v_0), v + s * d + (v_1 - v_0), d))
+    return np.array(moved).T.copy()
 
 
 def _find_span(path: InertialPath, at_ns: int) -> InertialSpan:
@@ -131,23 +126,27 @@ def _follow_setpoints(
     observer: Observer, sent: tuple[tuple[int, Vec3], ...], at_ns: int, lag_s: Vec3
 ) -> tuple[Array, Array, Array]:
     """Compute position, velocity and acceleration (3,) at a time, by the setpoints behind the vehicle's lag."""
-    lags_s = np.maximum(lag_s, LEAST_LAG_S)
-    (position, velocity, unexplained), accel = observer.mean, observer.accel_mps2
+    lags_s = [max(lag, LEAST_LAG_S) for lag in lag_s]
+    position, velocity, unexplained = observer.mean.tolist()
+    accel: list[float] = observer.accel_mps2.tolist()
     first = bisect_right(sent, observer.at_ns, key=_TIME)
     last = bisect_left(sent, at_ns, lo=first, key=_TIME)
     acting = sent[first - 1][1] if first else ZERO
     for begin_ns, end_ns, setpoint in _split_spans(observer.at_ns, at_ns, acting, sent[first:last]):
         if end_ns <= begin_ns:
             continue
-        s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
-        # τ a' = u - a: a = u + (a_0 - u) e^(-s/τ), and ∫ (a - u) = (a_0 - u) τ (1 - e^(-s/τ))
-        remaining = np.exp(-s / lags_s)
-        lagging = (accel - u) * lags_s * (1.0 - remaining)
-        # p = p + s v + ½ s² (u + d) + τ ((a_0 - u) s - ∫ (a - u)); v = v + s (u + d) + ∫ (a - u)
-        position = position + s * velocity + 0.5 * s * s * (u + unexplained) + lags_s * ((accel - u) * s - lagging)
-        velocity = velocity + s * (u + unexplained) + lagging
-        accel = u + (accel - u) * remaining
-    return position, velocity, accel
+        s = (end_ns - begin_ns) * 1e-9
+        # e^(-s/τ); numpy's exponential, as recordings were made with it
+        decay = np.exp([-s / lag for lag in lags_s]).tolist()
+        for i, (u, d, lag, remaining) in enumerate(zip(setpoint, unexplained, lags_s, decay, strict=True)):
+            # τ a' = u - a: a = u + (a_0 - u) e^(-s/τ), and ∫ (a - u) = (a_0 - u) τ (1 - e^(-s/τ))
+            above = accel[i] - u
+            lagging = above * lag * (1.0 - remaining)
+            # p = p + s v + ½ s² (u + d) + τ ((a_0 - u) s - ∫ (a - u)); v = v + s (u + d) + ∫ (a - u)
+            position[i] = position[i] + s * velocity[i] + 0.5 * s * s * (u + d) + lag * (above * s - lagging)
+            velocity[i] = velocity[i] + s * (u + d) + lagging
+            accel[i] = u + above * remaining
+    return np.array(position), np.array(velocity), np.array(accel)
 
 
 def _split_spans(
@@ -169,7 +168,7 @@ def correct_observer(observer: Observer, position: Array, std_m: float) -> tuple
     gain = observer.cov[:, :1] / variance  # (3, 1)
     mean, is_clipped = _correct_mean(observer.mean, position, gain, bound)
     # P = (I - K H) P (I - K H)' + R K K'
-    keep = np.eye(3)
+    keep = _IDENTITY.copy()
     keep[:, :1] -= gain
     cov = keep @ observer.cov @ keep.T + noise * (gain * gain.T)
     inertial = observer.inertial
@@ -182,9 +181,9 @@ def correct_observer(observer: Observer, position: Array, std_m: float) -> tuple
 def _correct_mean(mean: Array, position: Array, gain: Array, bound: float) -> tuple[Array, bool]:
     """Correct a mean (3, 3) by an innovation clipped to a bound; return too whether it was beyond."""
     # ν = y - p, within ±b; x = x + K ν
-    innovation = position - mean[0]
-    inside = np.minimum(np.maximum(innovation, -bound), bound)
-    return mean + gain * inside, bool((inside != innovation).any())
+    innovation = (position - mean[0]).tolist()
+    inside = [min(max(v, -bound), bound) for v in innovation]
+    return mean + gain * np.array(inside), inside != innovation
 
 
 def measure_size_mps2(accel_mps2: Array | Vec3) -> float:

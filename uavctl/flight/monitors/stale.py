@@ -196,7 +196,7 @@ def _record_repeat(record: SourceRecord, kalman: Kalman, history: FilterHistory,
 def _record_change(record: SourceRecord, sample: PositionSample, at_ns: int, offset_m: Array) -> SourceRecord:
     moved_m = [abs(new - old) for new, old in zip(sample.position_m, record.position_m, strict=True)]
     smallest = min(one for one in moved_m if one)
-    noise_m = float(np.abs(offset_m).max())
+    noise_m = max(map(abs, offset_m.tolist()))
     changes = min(record.changes + 1, _ENOUGH_CHANGES)
     again = float(0 < record.repeats < _REPEATS)
     return SourceRecord(

@@ -68,14 +68,15 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     """
     at_ns, path, parameters = observation.at_ns, observation.motion.vehicle_path, observation.parameters
     offsets = _add_offset(state.offsets, observation)
-    slope = _fit_slope(offsets, parameters)
+    points = np.array([point for _, point in offsets])
+    slope = _fit_slope(offsets, points, parameters)
     if slope is None:
         # Over a gap the vehicle's own distance is not known so well.
         places = state.places if len(offsets) > 1 else ()
         return replace(state, offsets=offsets, places=places, apart_mps=None, apart_ns=None), NO_VERDICT
     resumed_ns = observation.motion.resumed_ns
     corrects = resumed_ns is not None and at_ns - parameters.window_ns < resumed_ns + CORRECTS_NS
-    drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, parameters)
+    drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, points, parameters)
     apart = _remove_delay(slope, path, offsets)
     apart_mps = math.hypot(*apart)
     is_contradicted = apart_mps > parameters.disagreement_mps
@@ -115,12 +116,12 @@ def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:
 
 
 def _find_drift(
-    places: Places, offsets: Offsets, parameters: EnvelopeParameters
+    places: Places, offsets: Offsets, points: Array, parameters: EnvelopeParameters
 ) -> tuple[tuple[float, list[float]] | None, Places]:
     """Find the time [s] in which offsets changed too much, and the change (3,) [m]; return too the places after it."""
     at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
     # ō = Σ o_i / n
-    mean: Array = np.add.reduce([one for _, one in offsets], axis=0) / len(offsets)
+    mean: Array = np.add.reduce(points, axis=0) / len(offsets)
     place: list[float] = mean.tolist()
     places = places[bisect_right(places, at_ns - PLACES_NS, key=_TIME) :]
     for since_ns, before in places:
@@ -133,14 +134,14 @@ def _find_drift(
     return None, places
 
 
-def _fit_slope(offsets: Offsets, parameters: EnvelopeParameters) -> Array | None:
+def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) -> Array | None:
     """Fit the velocity (3,) [m/s] of the line through offsets; None where they are too few, or too close in time."""
     if len(offsets) < LEAST_OFFSETS or offsets[-1][0] - offsets[0][0] < SHORTEST * parameters.window_ns:
         return None
     times_s = np.array([(at_ns - offsets[0][0]) * 1e-9 for at_ns, _ in offsets])
     # slope = Σ (t_i - t̄) o_i / Σ (t_i - t̄)²
     centred = times_s - np.add.reduce(times_s) / len(times_s)
-    slope: Array = centred @ np.array([one for _, one in offsets]) / float(centred @ centred)
+    slope: Array = centred @ points / float(centred @ centred)
     return slope
 
 
