@@ -9,7 +9,7 @@ import pytest
 from loopback_rig import make_loop
 from rich.console import Console
 from sim_rig import decode
-from soak_take_off import is_troubled, judge_at_limit, judge_outcome
+from soak_take_off import fly_troubled_take_off, judge_at_limit, judge_outcome
 from take_off_rig import RELAYED, TakeOffRig
 
 from logs.recording.replay import replay
@@ -26,7 +26,7 @@ SEEDS = 10
 @BOTH
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_a_vehicle_that_took_off_is_engaged_or_landed_and_a_refusal_has_a_reason(autopilot: str, seed: int) -> None:
-    flight = is_troubled(autopilot, seed)
+    flight = fly_troubled_take_off(autopilot, seed)
     what = judge_at_limit(flight)
     assert what != "hovers", (flight.state, flight.texts)
     assert what == "engaged" or flight.loop.failure, flight.texts

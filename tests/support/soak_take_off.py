@@ -40,7 +40,7 @@ class TakeOff:
         what: What had become of the true vehicle: engaged, refused, landed; or what must not be.
         reached: Whether it had been engaged at any time.
         seconds: When that was so.
-        texts: What the console had said of it.
+        told: Texts on the console.
         sentence: How it ended.
         wrong: What it did and should not have.
     """
@@ -50,12 +50,12 @@ class TakeOff:
     what: str
     reached: bool
     seconds: float
-    texts: tuple[str, ...]
+    told: tuple[str, ...]  # key of the report in JSON
     sentence: str
     wrong: tuple[str, ...]
 
 
-def is_troubled(autopilot: str, seed: int) -> TakeOffRig:
+def fly_troubled_take_off(autopilot: str, seed: int) -> TakeOffRig:
     """A take-off with checks that flicker, and a position that is not valid for a while after arming.
 
     PX4 says all that it says unasked, and climbs to the height of the order by itself, as the guide has it set. With
@@ -107,7 +107,7 @@ def judge_at_limit(flight: TakeOffRig) -> str:
 
 def fly_take_off(autopilot: str, seed: int) -> TakeOff:
     """Fly one and judge it; what is still on its way down at the limit is looked at until it is there."""
-    flight = is_troubled(autopilot, seed)
+    flight = fly_troubled_take_off(autopilot, seed)
     what = judge_at_limit(flight)
     seconds, wrong = flight.now_ns * 1e-9, []
     texts = tuple(event.text for event in flight.notices)
