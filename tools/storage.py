@@ -38,7 +38,7 @@ from cost_rig import flown_ticks, measure_cost  # the tests' own
 from cut_rig import NAME, Cuts, check_cut, check_refusal
 from flip_rig import FlipTest
 from kill_rig import KINDS, LOG, KillResult, kill_once, truth
-from operation_rig import open_scene, wait_for_end
+from operation_rig import end_process, open_scene
 from report_rig import omit_pages
 
 from uavctl.cli.app import run
@@ -152,7 +152,7 @@ def _killed_flights(first: int, runs: int) -> tuple[dict[str, str], dict[str, ob
     wrong: dict[str, str] = {}
     decisions = files = nothing = 0
     for seed in range(first, first + runs):
-        with open_scene() as air, wait_for_end(air.fly("f", *FLIGHT)) as process:
+        with open_scene() as air, end_process(air.fly("f", *FLIGHT)) as process:
             assert process.stderr is not None
             while "recording to" not in process.stderr.readline():
                 assert process.poll() is None, "the daemon does not start"

@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, reserve_port, wait_for_end
+from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, end_process, reserve_port
 from patience import wait_until
 from places import ROOT, without_pages
 
@@ -179,7 +179,7 @@ def fly_fleet() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen
             fleet = subprocess.Popen(
                 [*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environ
             )
-            with wait_for_end(fleet):
+            with end_process(fleet):
                 # Nobody would fly them while the daemons begin.
                 wait_until(
                     lambda: all(health["pid"] for health in read_status(path)), "both daemons listen", pause_s=0.5

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 from loopback_rig import make_loop
-from operation_rig import wait_for_end
+from operation_rig import end_process
 from places import TESTS, without_pages
 
 from logs.recording.reader import read, records
@@ -53,7 +53,7 @@ def daemon(port: int, out: Path, *options: str) -> Iterator[subprocess.Popen[str
     process = subprocess.Popen(
         [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=without_pages()
     )
-    with wait_for_end(process):
+    with end_process(process):
         assert process.stderr is not None
         for line in process.stderr:
             if "recording to" in line:

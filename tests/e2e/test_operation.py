@@ -15,7 +15,7 @@ from importlib.resources import files
 from itertools import groupby
 
 import pytest
-from operation_rig import Scene, open_scene, wait_for_end
+from operation_rig import Scene, end_process, open_scene
 from patience import LIMIT_S, wait_until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
@@ -44,10 +44,10 @@ def read_decisions(air: Scene, out: str = "f") -> list[Decision]:
 @pytest.mark.fault(35)
 def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(air: Scene) -> None:
     assert air.ctl("status")[0] == 1 and "start one with `uavctl fly`" in air.ctl("status")[2]
-    with wait_for_end(air.fly("f")) as process:
+    with end_process(air.fly("f")) as process:
         wait_for_flight(air)
 
-        with wait_for_end(air.fly("second")) as second:
+        with end_process(air.fly("second")) as second:
             _, errors = second.communicate(timeout=LIMIT_S)
         assert second.returncode == 1 and f"process {process.pid} flies this vehicle already" in errors
         assert not list((air.folder / "second").glob("*"))
@@ -77,7 +77,7 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
 @pytest.mark.slow
 @pytest.mark.fault(31)
 def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
-    with wait_for_end(air.fly("f")) as process:
+    with end_process(air.fly("f")) as process:
         wait_for_flight(air)
         # What is on the disk once stays there: the last second at most may be lost.
         wait_until(
@@ -96,7 +96,7 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
     air.wait_for_flight(3.0)
     assert air.tap.read_frames() == spoken
     assert len(read_decisions(air)) >= kept
-    with wait_for_end(air.fly("again")) as process:  # lock and socket of the dead one do not stand in the way
+    with end_process(air.fly("again")) as process:  # lock and socket of the dead one do not stand in the way
         wait_until(lambda: air.ctl("status")[0] == 0, "the next daemon answers")
         wait_until(lambda: air.status()["age_s"] is not None and bool(air.status()["vehicle"]), "it hears all it needs")
         air.wait_for_flight(1.0)
@@ -122,7 +122,7 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
 @pytest.mark.slow
 @pytest.mark.fault(34)
 def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
-    with wait_for_end(air.fly("f")) as process:
+    with end_process(air.fly("f")) as process:
         wait_for_flight(air)
         assert air.ctl("goto", "-1,0.5,-1.4")[0] == 0  # wherever it is by now
         wait_until(
@@ -157,7 +157,7 @@ def test_the_service_manager_gets_the_status_and_no_watchdog_of_a_hanging_loop(a
 
             wait_until(heard_enough, "what the manager is to be told", pause_s=0.0)
 
-        with wait_for_end(air.fly("f", environ=environ)) as process:
+        with end_process(air.fly("f", environ=environ)) as process:
             hear(lambda: received.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in text for text in received))
             process.send_signal(signal.SIGSTOP)
             manager.settimeout(1.0)
@@ -184,7 +184,7 @@ def test_a_recording_that_is_deleted_while_flying_is_reported_at_once_and_in_the
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
-        with wait_for_end(air.fly("f", environ={**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify")})) as process:
+        with end_process(air.fly("f", environ={**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify")})) as process:
             wait_for_flight(air)
             assert air.status()["recorder"]["ok"]
             shutil.rmtree(air.folder / "f")
@@ -224,7 +224,7 @@ os.{call} = hanging
 def test_a_disk_that_hangs_while_flying_is_reported_and_the_flight_goes_on(air: Scene, call: str) -> None:
     flag = air.folder / "hangs"
     (air.folder / "sitecustomize.py").write_text(HANGING.format(call=call, flag=str(flag)))
-    with wait_for_end(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
+    with end_process(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
         wait_for_flight(air)
         flag.touch()
         wait_until(lambda: not air.status()["recorder"]["ok"], "the disk's hanging is seen")
@@ -244,7 +244,7 @@ def test_a_disk_that_hangs_while_flying_is_reported_and_the_flight_goes_on(air: 
 def test_several_daemons_are_distinguished_by_name(air: Scene) -> None:
     with open_scene("sim.seed=3") as second:
         second.control = air.control
-        with wait_for_end(air.fly("f")) as first, wait_for_end(second.fly("f")) as two:
+        with end_process(air.fly("f")) as first, end_process(second.fly("f")) as two:
             wait_until(lambda: len([*air.control.iterdir()] if air.control.exists() else []) == 2, "both listen")
             wait_until(lambda: "several daemons run" in air.ctl("status")[2], "both answer")
             names = [path.stem for path in air.control.iterdir()]

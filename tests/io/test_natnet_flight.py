@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from natnet_server import Body, Server
 from numpy.typing import NDArray
-from operation_rig import Scene, open_scene, wait_for_end
+from operation_rig import Scene, end_process, open_scene
 from patience import LIMIT_S, wait_until
 from sim_rig import decode
 
@@ -61,7 +61,7 @@ def test_it_flies_on_a_body_of_motive_s_and_replays_without_it() -> None:
         def tracking() -> int:
             return sum(one.mode is ControlMode.TRACK for one in records(recording, Decision))
 
-        with seen_by_motive(air) as server, wait_for_end(air.fly("f")) as process:
+        with seen_by_motive(air) as server, end_process(air.fly("f")) as process:
             wait_until(recording.exists, "it records")
             wait_until(lambda: tracking() > 40 and moved_m(air) > 0.5, "it flies, and has gone some way")
             process.send_signal(signal.SIGINT)

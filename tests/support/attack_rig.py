@@ -87,7 +87,7 @@ class FakeVehicle:
         return False
 
     def step(self) -> None:
-        """Do what is due."""
+        """Run what is due."""
         now_s = time.monotonic()
         self.listen()
         self._move(now_s)
@@ -102,18 +102,18 @@ class FakeVehicle:
             self._send(self._cameras, self._eyes.vision(int(now_s * 1e6), *self._measure_position()))
 
     def send_heartbeat(self) -> None:
-        """Tell the mode."""
+        """Send a heartbeat with the mode."""
         self._send(self._vehicle, self._voice.heartbeat(self.mode, ARMED if self.armed else DISARMED))
 
     def take_over(self) -> None:
-        """Be the pilot who switches, and tell it."""
+        """Change the mode as the pilot does, and send it."""
         self.mode = POSITION_CONTROL
         self._accel = (0.0, 0.0, 0.0)
         self.velocity = [0.0, 0.0, 0.0]
         self.send_heartbeat()
 
     def listen(self) -> None:
-        """Take what has come."""
+        """Receive pending datagrams."""
         while True:
             try:
                 data = self._vehicle.recv(2048)
@@ -312,7 +312,7 @@ class DaemonFlight:
         self.vehicle.run(LIMIT_S, lambda: self.process.poll() is not None)
 
     def read_report(self, window: Window) -> AttackReport:
-        """What the recording says of a part."""
+        """Return the figures of a part from the recording."""
         result = AttackReport()
         mode = ControlMode.TRACK
         for _, at_ns, record in read(self.folder / "f" / "flight.mcap"):

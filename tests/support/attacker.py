@@ -63,7 +63,7 @@ def _stamp() -> int:
 
 
 def _signed(make_packet: Callable[[], bytes], key: bytes, link_id: int, ahead: int) -> MakeDatagram:
-    """Datagrams full of one frame, signed anew every few milliseconds with stamps that go up."""
+    """Make datagrams full of one frame, signed again every few milliseconds with increasing stamps."""
     plain = make_packet()
     body = bytearray(plain[:-2])
     body[2] |= mavlink.MAVLINK_IFLAG_SIGNED

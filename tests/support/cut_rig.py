@@ -1,4 +1,4 @@
-"""A recorded flight that ends anywhere: recovered or not, it replays alike up to there, and says that it is cut."""
+"""A recorded flight that ends anywhere: recovered or not, its replay is identical up to there, and reports the cut."""
 
 from __future__ import annotations
 

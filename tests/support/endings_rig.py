@@ -1,4 +1,4 @@
-"""`uavctl fly` itself in virtual time against the simulated peers, and every place that tells how it ended."""
+"""`uavctl fly` in virtual time against the simulated peers, and all reports of its ending."""
 
 from __future__ import annotations
 
@@ -113,8 +113,8 @@ class EndingRig:
     """One flight of the command, with what the test does on the way: each step once its time has come.
 
     Attributes:
-        is_delivered: Whether the vehicle hears a datagram of ours.
-        is_received: Whether we hear one of the vehicle's.
+        is_delivered: Whether the vehicle receives a datagram of ours.
+        is_received: Whether we receive one of the vehicle's.
         sent: Each datagram of ours, with its time.
         steps: (when, what) in their order.
         statuses: What `uavctl ctl status --json` has answered.
@@ -146,7 +146,7 @@ class EndingRig:
         self.health_monitor: HealthMonitor | None = None
         self.notified_texts: list[str] = []
 
-    # What a step may look at, and do
+    # Methods for steps
 
     def is_in(self, state: HandoverState) -> bool:
         return self.loop is not None and self.loop.handover_state is state
@@ -161,7 +161,7 @@ class EndingRig:
         self.peers.autopilot.pilot.change_mode(kind.get_mode(mode), self.now_ns)
 
     def add_step_in(self, state: HandoverState, do: Callable[[EndingRig], None], *, after_s: float = 0.0) -> EndingRig:
-        """A step once the hand-over has been in a state for a while."""
+        """Add a step once the hand-over has been in a state for `after_s`."""
         since: list[int] = []
 
         def due(rig: EndingRig) -> bool:
@@ -173,12 +173,12 @@ class EndingRig:
         return self
 
     def add_step_after(self, seconds: float, do: Callable[[EndingRig], None]) -> EndingRig:
-        """A step so long after the start."""
+        """Add a step at a time after the start [s]."""
         self.steps.append((lambda rig: rig.now_ns >= seconds * SECOND_NS, do))
         return self
 
     def request_status(self) -> None:
-        """Ask the daemon as an operator does, in a process beside it; its answer comes with one of the next ticks."""
+        """Request the status as an operator does, in a process of its own; the reply comes in one of the next ticks."""
         assert self.listener is not None
         folder = Path(self.listener.getsockname()).parent
         arguments = [sys.executable, "-m", "uavctl", "ctl", "status", "--json", "--control", str(folder)]
@@ -219,12 +219,12 @@ def interrupt(rig: EndingRig) -> None:
 
 
 def read_page_text(page: Path) -> str:
-    """The text of a page."""
+    """Return the text of a page."""
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.read_text())).split())
 
 
 class EndingReport:
-    """How a flight ended, as every place tells it."""
+    """Ending of a flight as console, page, status, recording and JSON report it."""
 
     def __init__(self, rig: EndingRig, code: int, out: str, err: str) -> None:
         self.code = code
@@ -246,7 +246,7 @@ class EndingReport:
         return document
 
     def assert_agreement(self) -> None:
-        """All places have the one sentence, and the exit code goes with it."""
+        """Assert that all reports have the same sentence, and the exit code that belongs to it."""
         sentence = self.ending["sentence"]
         assert f"ended: {sentence}" in self.console
         if self.ending["code"] != Cause.ENDED_IN_AIR:  # then nobody can ask any more when it is known
@@ -277,7 +277,7 @@ class EndingReport:
 
 @contextmanager
 def use_virtual_time(rig: EndingRig) -> Iterator[None]:
-    """The command's clock, connections and threads in our hands."""
+    """Replace clock, connections and threads of the command."""
 
     @contextmanager
     def open_links(*given: object) -> Iterator[dict[str, PeerConnection]]:
@@ -311,7 +311,7 @@ def use_virtual_time(rig: EndingRig) -> Iterator[None]:
 
 
 def fly_command(rig: EndingRig, capsys: pytest.CaptureFixture[str], *arguments: str) -> EndingReport:
-    """Type `uavctl fly` and look at what has become of it."""
+    """Run `uavctl fly` and return the report of its ending."""
     with socket.socket(type=socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         url = f"udpin://127.0.0.1:{sock.getsockname()[1]}"

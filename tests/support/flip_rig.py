@@ -1,4 +1,4 @@
-"""One flipped byte in a small recording: what its readers may then say."""
+"""One flipped byte in a small recording: the permitted results of its readers."""
 
 from __future__ import annotations
 

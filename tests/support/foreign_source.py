@@ -24,7 +24,7 @@ NEAR_M, SLOW_MPS = 0.1, 0.1
 
 
 class Vehicle:
-    """A point mass without friction, moved in real time by what it was told last, and what it has got."""
+    """A point mass without friction, moved in real time by the last setpoint, and its received messages."""
 
     def __init__(self, now: float) -> None:
         self.now, self.accel_mps2 = now, [0.0, 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""A hand-over in virtual time, and a vehicle whose words are put into its mouth."""
+"""A hand-over in virtual time, and a vehicle whose reports the test sets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOTHING, NEUTRAL, FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode
 
 
 class HandoverRig:
-    """A hand-over and a vehicle whose words are put into its mouth; it says every tick who it is, unless it is mute."""
+    """Hand-over, and a vehicle whose reports the test sets; it sends its status every tick unless it is mute."""
 
     def __init__(self, autopilot: str = "px4", config: HandOverConfig | None = None) -> None:
         self.hand_over = HandoverStateMachine(config)
@@ -43,7 +43,7 @@ class HandoverRig:
         return self.hand_over.state
 
     def report_status(self, **fields: object) -> None:
-        """Change what the vehicle says of itself."""
+        """Change the status that the vehicle reports."""
         assert self.vehicle is not None
         mode = fields.get("mode", self.vehicle.mode)
         external = mode in ("OFFBOARD", "GUIDED")

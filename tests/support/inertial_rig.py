@@ -43,7 +43,7 @@ def convert_to_si(msg: Any) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class InertialRecord:
-    """Rows every 20 ms: specific force, body rates and attitude as told, and the truth at their stamps."""
+    """Rows every 20 ms: specific force, body rates and attitude as reported, and the truth at their stamps."""
 
     time_s: Array
     force: Array
@@ -55,7 +55,7 @@ class InertialRecord:
 
     @property
     def acceleration(self) -> Array:
-        """Acceleration in NED by what was told."""
+        """Return the acceleration in NED by the reports."""
         accel_mps2: Array = np.einsum("nij,nj->ni", make_rotations(self.attitude), self.force) + np.array([0.0, 0.0, G])
         return accel_mps2
 
@@ -99,7 +99,7 @@ def make_velocity_wave(t: float) -> tuple[float, float, float]:
 def record_flight(
     rig: SimRig, name: str, seconds: float, velocity: Callable[[float], tuple[float, ...]] = make_velocity_wave
 ) -> InertialRecord:
-    """Fly velocities and keep what is told every 20 ms of the first unit and of the attitude."""
+    """Fly velocities and record the reports of the first unit and of the attitude every 20 ms."""
     request_streams(rig, FIRST[name], QUATERNION)
     truth, first = [], len(rig.seen)
     for i in range(round(seconds / PERIOD_S)):

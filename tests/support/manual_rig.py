@@ -1,4 +1,4 @@
-"""The manual's blocks, and a machine of its own to type them on: a scratch folder, and ports nobody else has."""
+"""Commands of the manual, and a shell to run them: in a scratch folder, with ports of its own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LIMIT_S = 300.0  # for what is stuck
 
 
 def find_blocks(page: str, language: str, section: str = "") -> list[str]:
-    """Blocks of a page in a language, or those of the section whose heading begins so."""
+    """Return the blocks of a page in a language, or those of a section, by the begin of its heading."""
     text = (ROOT / page).read_text(encoding="utf-8")
     if section:
         (text,) = re.findall(rf"^#+ {re.escape(section)}.*?(?=^#+ |\Z)", text, re.M | re.S)
@@ -35,13 +35,13 @@ def find_blocks(page: str, language: str, section: str = "") -> list[str]:
 
 
 def find_commands(page: str, section: str = "") -> list[str]:
-    """Commands of a page in their order, without comments; a line that goes on in the next one is one command."""
+    """Return the commands of a page in order, without comments; continued lines are one command."""
     lines = "\n".join(find_blocks(page, "sh", section)).replace("\\\n", " ").splitlines()
     return [command for line in lines if (command := re.sub(r"\s+# .*", "", line).strip())]
 
 
 def parse_keys(block: str) -> list[tuple[str, str, str]]:
-    """Table, key and value of each line of a TOML block."""
+    """Return table, key and value of each line of a TOML block."""
     results = []
     for table, body in _TABLE.findall(block):
         parts = (line.partition("=") for line in body.splitlines() if "=" in line)
@@ -50,7 +50,7 @@ def parse_keys(block: str) -> list[tuple[str, str, str]]:
 
 
 def apply_block(text: str, block: str) -> str:
-    """Change the lines of a configuration as a block says, where the table is there; else add it."""
+    """Apply the keys of a block to a configuration; add a table that is missing."""
     for table, key, value in parse_keys(block):
         line, result = f"{key} = {value}\n", re.search(rf"^\[{table}\]\n(?:(?!^\[).*\n?)*", text, re.M)
         if result is None:
@@ -65,7 +65,7 @@ def apply_block(text: str, block: str) -> str:
 
 @dataclass
 class ManualShell:
-    """A folder like a checkout, and a shell in it; the network is its own, or the default ports are locked."""
+    """Shell in a folder like a checkout, with a network of its own; without the right to one it locks the ports."""
 
     folder: Path
     network: tuple[str, ...]
@@ -73,7 +73,7 @@ class ManualShell:
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start(self, command: str) -> subprocess.Popen[bytes]:
-        """Begin a command."""
+        """Start a command."""
         log = (self.folder / f"log-{len(self.processes)}").open("wb")
         process = subprocess.Popen(
             [*self.network, "sh", "-c", f"exec {command}" if command.startswith("uavctl ") else command],
@@ -84,21 +84,21 @@ class ManualShell:
         return process
 
     def read_output(self, process: subprocess.Popen[bytes]) -> str:
-        """What a command has written."""
+        """Read the output of a command."""
         return (self.folder / f"log-{self.processes.index(process)}").read_text(errors="replace")
 
     def wait_for_end(self, process: subprocess.Popen[bytes], command: str, code: int = 0) -> str:
-        """Wait for the end of a command; what it wrote."""
+        """Wait for the end of a command; return its output."""
         result = process.wait(LIMIT_S)
         assert result == code, f"{command}: exit code {result}, not {code}\n{self.read_output(process)}"
         return self.read_output(process)
 
     def run(self, command: str, code: int = 0) -> str:
-        """Type a command, and wait for its end."""
+        """Run a command to its end; return its output."""
         return self.wait_for_end(self.start(command), command, code)
 
     def wait_for_text(self, process: subprocess.Popen[bytes], text: str) -> None:
-        """Wait until a command has written something."""
+        """Wait until a command has written a text."""
 
         def read_output() -> bool:
             assert process.poll() is None or text in self.read_output(process), self.read_output(process)
@@ -107,18 +107,18 @@ class ManualShell:
         wait_until(read_output, f"it says {text!r}")
 
     def wait_for_success(self, command: str) -> None:
-        """Type a command again and again, until it ends well."""
+        """Repeat a command until it succeeds."""
         wait_until(lambda: self.start(command).wait(LIMIT_S) == 0, command, pause_s=0.5)
 
     def stop(self, process: subprocess.Popen[bytes]) -> None:
-        """Press Ctrl-C."""
+        """Stop a command by Ctrl-C."""
         process.send_signal(signal.SIGINT)
         process.wait(LIMIT_S)
 
 
 @contextmanager
 def _network() -> Iterator[tuple[str, ...]]:
-    """Words before a command that let it run in a network of its own; without the right to that, wait for the ports."""
+    """Yield a command prefix for a network of its own; without the right to one, lock the default ports."""
     holder = subprocess.Popen(
         ["unshare", "-n", "sh", "-c", "ip link set lo up && echo up && exec sleep infinity"], stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL, text=True,
@@ -140,7 +140,7 @@ def _network() -> Iterator[tuple[str, ...]]:
 
 @contextmanager
 def open_shell(folder: Path) -> Iterator[ManualShell]:
-    """A desk with a checkout's folders on it; what was begun there and still runs is ended."""
+    """Open a shell in a folder with the parts of a checkout; end running commands at the end."""
     for name in ("uavctl", "docs", "tools", "sim", "logs"):
         (folder / name).symlink_to(ROOT / name)
     (folder / "duo.toml").write_bytes((ROOT / "docs/examples/duo.toml").read_bytes())

@@ -43,7 +43,7 @@ def reserve_port() -> socket.socket:
 
 
 class VehicleTap:
-    """Sits between vehicle and daemon, hands everything on, and counts what the daemon says."""
+    """Relay between vehicle and daemon that counts the datagrams of the daemon."""
 
     def __init__(self, daemon_port: int) -> None:
         self.spoken = 0  # datagrams of the daemon's
@@ -181,7 +181,7 @@ def open_scene(*overrides: str) -> Iterator[Scene]:
 
 
 @contextmanager
-def wait_for_end(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
+def end_process(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
     """End a process with the block, if it has not ended by itself."""
     try:
         yield process

@@ -1,23 +1,23 @@
-"""Waiting for what other threads and processes do: for a condition, never for a time."""
+"""Waiting for other threads and processes: for a condition, never for a time."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
-LIMIT_S = 60.0  # for what is stuck, not for what is slow: a machine may have much else to do
+LIMIT_S = 60.0  # detects a hang; a busy machine may be slow
 
 
 def wait_until(condition: Callable[[], bool], what: str, *, pause_s: float = 0.02) -> None:
-    """Wait until something holds.
+    """Wait until a condition is true.
 
     Args:
-        condition: asked again and again, at least once.
-        what: what is waited for, in words.
-        pause_s: between two questions; 0 if the question itself waits.
+        condition: Checked repeatedly, at least once.
+        what: Name of the condition for the message.
+        pause_s: Pause between two checks; 0 if the check itself waits.
 
     Raises:
-        AssertionError: it does not within `LIMIT_S`.
+        AssertionError: It is not true within `LIMIT_S`.
     """
     end_s = time.monotonic() + LIMIT_S
     while not condition():

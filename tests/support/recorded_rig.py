@@ -55,7 +55,7 @@ def truth(name: str) -> NDArray[np.float64]:
 
 @cache
 def events(name: str) -> tuple[tuple[float, str], ...]:
-    """What an observer saw and told the rig to do: seconds since the first packet, and his words."""
+    """Return the notes of an observer: time since the first packet [s], and text."""
     text = lzma.decompress((FLIGHTS / f"{name}-events.txt.xz").read_bytes()).decode()
     rows = (line.split(maxsplit=1) for line in text.splitlines())
     return tuple((float(time), arguments) for time, arguments in rows)
@@ -89,7 +89,7 @@ def run_check(name: str, since_s: float, seconds: float, *overrides: str) -> dic
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """A control loop that heard a part of a recording, and what it recorded; nobody flew its setpoints."""
+    """A control loop that received a part of a recording, and its records; its setpoints were not flown."""
 
     name: str
     loop: ControlLoop
@@ -138,7 +138,7 @@ def make_page_data(memory: MemorySink) -> FlightData:
 
 
 def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
-    """What a link makes of the vehicle's words, with times since the first packet [s]."""
+    """Return the vehicle statuses that a link parses, with times since the first packet [s]."""
     whole = packets(name)
     link = make_links(load_flight_config(name))[VEHICLE]
     received = (

@@ -49,7 +49,7 @@ class SignatureChannel:
         return self.gates[link].verify_frames(data, at_ns)
 
     def take_refused(self, loop: ControlLoop, at_ns: int) -> None:
-        """What did not, since this was last told."""
+        """Return the number of refused datagrams since the last call."""
         for name, gate in self.gates.items():
             new = gate.refused - self.told[name]
             self.told[name] = Counter(gate.refused)
@@ -133,7 +133,7 @@ class ReplayRig:
                 self.loop.receive(link, bytes(data), at_ns)
 
     def _reboot(self, next_tick: int) -> None:
-        """The vehicle starts anew with the next tick, its cameras and its link with it."""
+        """Restart the vehicle, its cameras and its link with the next tick."""
         plan, world = self.plan, self.world
         per_step = round(plan.config.plant.dt_s / plan.config.daemon.tick_s)
         if world is None or plan.reboot_step is None or next_tick != plan.reboot_step * per_step:
@@ -153,7 +153,7 @@ class ReplayedFlight:
     Attributes:
         seed: Of the flight.
         path: Its recording.
-        labels: What it had; see `Drawn.words`.
+        labels: What it had; see `FlightDraw.labels`.
         result: What the replay found.
         record_counts: Modes, solves and events that the flight had, each with a count.
         files: Files of the recording.

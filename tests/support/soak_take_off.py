@@ -40,7 +40,7 @@ class TakeOff:
         what: What had become of the true vehicle: engaged, refused, landed; or what must not be.
         reached: Whether it had been engaged at any time.
         seconds: When that was so.
-        texts: What the console had said of it.
+        told: Texts on the console.
         sentence: How it ended.
         wrong: What it did and should not have.
     """
@@ -50,7 +50,7 @@ class TakeOff:
     what: str
     reached: bool
     seconds: float
-    texts: tuple[str, ...]
+    told: tuple[str, ...]  # key of the report in JSON
     sentence: str
     wrong: tuple[str, ...]
 

@@ -1,4 +1,4 @@
-"""Numbers of a sentence, so that tests hold what it says and not how it says it."""
+"""Numbers of a sentence, so that tests check its figures and not its wording."""
 
 from __future__ import annotations
 

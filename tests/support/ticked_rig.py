@@ -6,7 +6,7 @@ from uavctl.records import Command, ControlMode, Decision, Event, Ticked
 
 
 def ticked(at_ns: int, *, answers: tuple[tuple[Command, Event], ...] = ()) -> Ticked:
-    """A tick of nobody's, which waits; its time and its answers are all that matters."""
+    """Return a waiting tick; tests use only its time and its answers."""
     decision = Decision(
         tick=0, at_ns=at_ns, step=0, boundary=False, mode=ControlMode.WAIT, age_steps=None, news=False, plan_seq=None,
         plan_index=None, solve=None, input=None, fresh=0, missed_ticks=0, accepted=0, rejected=0, reason="",

@@ -52,7 +52,7 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
 
 
 def assert_in_order(recording: Path, dt_ns: int) -> None:
-    """No tick and no step is unaccounted for, and what the vehicle flew is what it was told."""
+    """Assert that no tick and no step is missing, and that the vehicle flew the setpoints."""
     decisions, truths = list(records(recording, Decision)), list(records(recording, Truth))
     assert sum(1 + decision.missed_ticks for decision in decisions) == decisions[-1].tick + 1
     assert {after.at_ns - before.at_ns for before, after in pairwise(truths)} == {dt_ns}
