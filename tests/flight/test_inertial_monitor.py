@@ -83,7 +83,7 @@ def test_a_reading_is_plausible_up_to_three_standard_deviations_in_each_axis(axi
     for share, plausible in ((3.0, True), (-3.0, True), (3.001, False), (-3.001, False)):
         innovation = np.zeros(3)
         innovation[axis] = share * stds[axis]
-        assert is_plausible(innovation, stds**2) is plausible
+        assert is_plausible(tuple(innovation), tuple(stds**2)) is plausible
 
 
 def test_a_position_is_consistent_up_to_a_squared_distance_of_40() -> None:
