@@ -8,8 +8,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, make_horizon
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, make_horizon
 
 Array = NDArray[np.float64]
 

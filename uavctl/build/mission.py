@@ -120,7 +120,7 @@ def wanted_positions(given: TrajectoryConfig, design: AnyDesign, dead_s: float) 
 
 def build_rests(design: Design) -> Array:
     """Right sides (m_x,) of the state rows, less the back-offs of the design's terminal set."""
-    from uavctl.smpc.hahn_stursberg.horizon import decompose
+    from uavctl.smpc.hahn_stursberg.components import decompose
     from uavctl.smpc.hahn_stursberg.program import terminal_backoff_x
 
     rests = design.state_set.b.copy()

@@ -14,7 +14,7 @@ from uavctl.build.controller import build_problem, build_spec, needed
 from uavctl.lab.paper.runs import DRAWN, LIKELIHOOD, Flights, Setup, Totals, fly_runs, planes
 from uavctl.smpc.baselines import Lqg, WorstCaseDelay
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
-from uavctl.smpc.nominal import stationary_bound
+from uavctl.smpc.lqg_bound import stationary_bound
 from uavctl.smpc.sets import Polytope
 
 # What the paper's example came to; one document.
