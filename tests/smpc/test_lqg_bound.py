@@ -14,7 +14,8 @@ from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.baselines import Lqg
 from uavctl.smpc.link import LatePackets, LinkModel, bernoulli, empirical, gilbert_elliott
-from uavctl.smpc.nominal import lqr, stationary_bound
+from uavctl.smpc.lqg_bound import stationary_bound
+from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import Plant
 
 STEPS = 50

@@ -13,10 +13,11 @@ from plant_cases import NAMED, spec_of
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
-from uavctl.smpc.baselines import CascadedPid, HoldLast, Lqg, PacketisedPredictive, PidGains, WorstCaseDelay, ZeroOnLoss
+from uavctl.smpc.baselines import HoldLast, Lqg, PacketisedPredictive, WorstCaseDelay, ZeroOnLoss
 from uavctl.smpc.batch import BatchController, Information
 from uavctl.smpc.hahn_stursberg.design import DesignSpec
 from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.pid import CascadedPid, PidGains
 from uavctl.smpc.sets import Polytope
 
 Counts = NDArray[np.intp]

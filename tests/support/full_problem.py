@@ -8,8 +8,9 @@ from functools import cache
 import numpy as np
 
 from uavctl.arrays import Array
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, make_horizon
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, make_horizon
 
 
 @cache

@@ -16,10 +16,12 @@ from uavctl.arrays import Array
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
-from uavctl.smpc.hahn_stursberg.exact import PartSolver, add_late_designs
+from uavctl.smpc.hahn_stursberg.exact import PartSolver
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
+from uavctl.smpc.hahn_stursberg.horizon import make_horizon
+from uavctl.smpc.hahn_stursberg.late import add_late_designs
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.link import bernoulli

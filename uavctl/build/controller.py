@@ -249,7 +249,8 @@ def build_design(config: Config) -> Design:
         DesignError: There is none; the error has key, reason and advice.
     """
     from uavctl.smpc.hahn_stursberg.design import make_design
-    from uavctl.smpc.hahn_stursberg.exact import add_late_designs, check_schedule, optimal_cost
+    from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost
+    from uavctl.smpc.hahn_stursberg.late import add_late_designs
 
     spec = build_spec(config)
     design = make_design(spec, optimal_cost)

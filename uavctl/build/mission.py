@@ -129,7 +129,7 @@ def sample_trajectory(
 
 def build_rest_limits(design: Design) -> Array:
     """Return the right sides (m_x,) of the state rows, less the back-offs of the design's terminal set."""
-    from uavctl.smpc.hahn_stursberg.horizon import decompose
+    from uavctl.smpc.hahn_stursberg.components import decompose
     from uavctl.smpc.hahn_stursberg.program import terminal_backoff_x
 
     rest_limits = design.state_set.b.copy()

@@ -2,7 +2,7 @@
 
 1. Units do not matter: ranks are decided, and programs solved, in numbers of similar size.
 2. Equilibria are the states with (I - A) x_s = B u_s. They have coordinates y: the values of chosen states.
-3. A `Polytope` is an admissible set C x <= b.
+3. A `Polytope` is an admissible set C x <= b; `find_pairs` groups its rows ±c, which share a back-off.
 """
 
 from __future__ import annotations
@@ -244,3 +244,20 @@ class Polytope:
         """Return b - C x (m,): negative where a limit is broken."""
         margin: Array = self.b - self.c @ x
         return margin
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Rows of one set with the same direction up to sign: c z <= upper, -c z <= lower."""
+
+    c: tuple[float, ...]
+    sides: tuple[tuple[float, int], ...]  # (sign, row)
+
+
+def find_pairs(c: Array) -> tuple[Pair, ...]:
+    """Group rows by their direction; a pair shares its back-off and its slack."""
+    groups: dict[tuple[float, ...], list[tuple[float, int]]] = {}
+    for i, row in enumerate(c):
+        sign = 1.0 if row[np.flatnonzero(row)[0]] > 0 else -1.0
+        groups.setdefault(tuple((sign * row).tolist()), []).append((sign, i))
+    return tuple(Pair(direction, tuple(sides)) for direction, sides in groups.items())

@@ -13,9 +13,10 @@ from uavctl.errors import UavctlError
 from uavctl.lab.paper import depth as deep
 from uavctl.lab.paper.claims import Depth
 from uavctl.lab.paper.depth import GridSize, compute_least_settled_cost, extract_component
+from uavctl.smpc.hahn_stursberg.components import decompose
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import decompose
-from uavctl.smpc.nominal import lqr, stationary_bound
+from uavctl.smpc.lqg_bound import stationary_bound
+from uavctl.smpc.nominal import lqr
 from uavctl.smpc.sets import Polytope
 
 COARSE = GridSize(states=35, inputs=31)

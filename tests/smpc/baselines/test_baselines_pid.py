@@ -10,9 +10,9 @@ from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, gains, noise, 
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
-from uavctl.smpc.baselines import CascadedPid, PidGains, _evaluate, tune
 from uavctl.smpc.batch import Information
 from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.pid import CascadedPid, PidGains, _evaluate, tune
 
 Scene = tuple[ControlProblem, NDArray[np.intp], Array]
 ACCEL = 0.49429632181478  # [m/s²] per unit of input

@@ -35,7 +35,7 @@ def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for name in ("design.make_design", "design.design_record", "design.assemble_design", "exact.check_schedule"):
         monkeypatch.setattr(f"uavctl.smpc.hahn_stursberg.{name}", refuse)
-    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.exact.add_late_designs", refuse)
+    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.late.add_late_designs", refuse)
     monkeypatch.setattr("uavctl.build.controller.build_rest_limits", refuse)
 
 

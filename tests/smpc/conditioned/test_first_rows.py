@@ -10,7 +10,7 @@ from uavctl.config import load_config
 from uavctl.lab.bench.run import draw_questions
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import ConditionedSolver
-from uavctl.smpc.qp import FirstRows
+from uavctl.smpc.first_rows import FirstRows
 
 
 def requested(name: str) -> list[Answer]:

@@ -25,10 +25,11 @@ from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, clip_inputs
 from uavctl.smpc.hahn_stursberg import exact as conic
+from uavctl.smpc.hahn_stursberg.components import decompose
 from uavctl.smpc.hahn_stursberg.cones import ConicProgram
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose
+from uavctl.smpc.hahn_stursberg.horizon import Horizon
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.hahn_stursberg.program import Program
 from uavctl.smpc.sets import Polytope

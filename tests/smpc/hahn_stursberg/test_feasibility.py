@@ -11,9 +11,10 @@ from optimisation_cases import ORIGIN, PAPER_COST, START, TAU_3, paper, paper_pl
 
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg import exact as feasibility
+from uavctl.smpc.hahn_stursberg.components import decompose
 from uavctl.smpc.hahn_stursberg.design import Design, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, check_schedule, optimal_cost
-from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, terminal_bound
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, terminal_bound
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 

@@ -15,9 +15,10 @@ from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL
+from uavctl.smpc.hahn_stursberg.components import decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.design import make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, PartSolver
-from uavctl.smpc.hahn_stursberg.horizon import decompose, make_horizon, make_whole_component
+from uavctl.smpc.hahn_stursberg.horizon import make_horizon
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import find_equilibria

@@ -10,8 +10,9 @@ from optimisation_cases import TAU_3, coupled, paper, paper_plant, room
 
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
+from uavctl.smpc.hahn_stursberg.components import Component, decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, make_whole_component, terminal_bound
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, terminal_bound
 from uavctl.smpc.sets import Polytope
 
 

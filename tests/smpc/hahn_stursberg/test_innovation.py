@@ -26,9 +26,9 @@ from uavctl.flight.kalman import (
 )
 from uavctl.records import PositionSample
 from uavctl.smpc.estimate import add_bias, innovation_form
+from uavctl.smpc.hahn_stursberg.components import decompose
 from uavctl.smpc.hahn_stursberg.design import Design, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, check_schedule
-from uavctl.smpc.hahn_stursberg.horizon import decompose
 from uavctl.smpc.plant import Plant, drag_lag
 
 STEP_NS = 200_000_000

@@ -24,8 +24,9 @@ from uavctl.errors import DesignError
 from uavctl.records import Decision, Plan, SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver, add_late_designs, make_late_design
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
+from uavctl.smpc.hahn_stursberg.late import add_late_designs, make_late_design
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
 

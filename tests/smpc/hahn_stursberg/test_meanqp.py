@@ -10,8 +10,9 @@ from scipy.linalg import null_space
 
 from uavctl.arrays import Array
 from uavctl.smpc.answer import Preview
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
+from uavctl.smpc.hahn_stursberg.horizon import make_horizon
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row, RowKind
 from uavctl.smpc.hahn_stursberg.policy import CovarianceProblem
 

@@ -13,8 +13,9 @@ from optimisation_cases import coupled
 from question_rig import EACH_PRESET, PRESETS, asked, case, design_of, exact_gains
 
 from uavctl.arrays import Array
+from uavctl.smpc.hahn_stursberg.components import decompose
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import decompose, make_horizon
+from uavctl.smpc.hahn_stursberg.horizon import make_horizon
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind
 from uavctl.smpc.hahn_stursberg.policy import CovarianceProblem, Policy, cheapest_policy
 

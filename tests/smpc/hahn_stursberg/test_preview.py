@@ -15,9 +15,9 @@ from scipy.linalg import null_space, solve_discrete_lyapunov
 from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, Path, Preview
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 
 
 @cache

@@ -15,8 +15,8 @@ from rich.console import Console
 from uavctl.cli.design import make_solve_document, render_solution
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
+from uavctl.smpc.hahn_stursberg.components import decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 
 

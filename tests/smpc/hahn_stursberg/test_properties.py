@@ -20,10 +20,11 @@ from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, Solver
 from uavctl.smpc.hahn_stursberg import exact as conic
+from uavctl.smpc.hahn_stursberg.components import decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, kappa, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
-from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, make_horizon, make_whole_component
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, make_horizon
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 

@@ -36,10 +36,10 @@ from uavctl.loop import ControlLoop
 from uavctl.records import Record, SolveStatus
 from uavctl.smpc.answer import KEPT_TOLERANCE, NOMINAL, Answer, Preview, Solver
 from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
 from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutSolver
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
 from uavctl.smpc.sets import Polytope
 

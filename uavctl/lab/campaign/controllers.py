@@ -39,18 +39,7 @@ from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSp
 from uavctl.lab.campaign.world import LinearWorld
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
-from uavctl.smpc.baselines import (
-    CascadedPid,
-    Governor,
-    HoldLast,
-    Lqg,
-    MeanQp,
-    PacketisedPredictive,
-    PidGains,
-    WorstCaseDelay,
-    ZeroOnLoss,
-    tune,
-)
+from uavctl.smpc.baselines import Governor, HoldLast, Lqg, MeanQp, PacketisedPredictive, WorstCaseDelay, ZeroOnLoss
 from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, SequentialDecider
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.smpc.estimate import innovation_form
@@ -58,6 +47,7 @@ from uavctl.smpc.hahn_stursberg.design import Design, kappa
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import SilencePlanner, make_answer
+from uavctl.smpc.pid import CascadedPid, PidGains, tune
 
 _STUDENT_DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
 

@@ -25,9 +25,10 @@ from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError, UavctlError
 from uavctl.lab.bench.timing import TimedCase, compute_median, time_cases
 from uavctl.lab.paper.claims import PRESET, PRINTED, Complexity, Depth, TriedDesign
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
+from uavctl.smpc.hahn_stursberg.horizon import make_horizon
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.nominal import lqr

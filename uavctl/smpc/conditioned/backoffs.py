@@ -34,7 +34,7 @@ from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, Part, propagate_covariance
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.qp import find_pairs
+from uavctl.smpc.sets import find_pairs
 
 PRICE = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
 MAX_RISK = 0.5  # largest risk of a row: with more, the mean would be outside of its limit

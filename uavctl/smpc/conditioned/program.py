@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
+from uavctl.smpc.first_rows import FirstRows
 from uavctl.smpc.nominal import ControlProblem, Lqr, Part, predict_regulated
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, FirstRows, QuadraticProgram, Sense, find_pairs
-from uavctl.smpc.sets import Equilibria, Polytope
+from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, QuadraticProgram, Sense
+from uavctl.smpc.sets import Equilibria, Polytope, find_pairs
 
 Index = NDArray[np.intp]
 

@@ -20,9 +20,9 @@ from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, clip_inputs, relative_gap
 from uavctl.smpc.batch import Decisions
+from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, PartAnswer, PartSolver, assemble
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind, dot_rows, multiply_rows
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.qp import EQUAL, SOFT, QuadraticProgram

@@ -20,7 +20,8 @@ from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon
 from uavctl.smpc.hahn_stursberg.program import factorise, terminal_backoff_u, terminal_backoff_x
-from uavctl.smpc.qp import OPEN, find_pairs
+from uavctl.smpc.qp import OPEN
+from uavctl.smpc.sets import find_pairs
 
 Index = NDArray[np.intp]
 

@@ -18,10 +18,10 @@ import numpy as np
 from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, clip_inputs, is_finite
+from uavctl.smpc.hahn_stursberg.components import Component, decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.cones import catch_panic
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import PartAnswer, assemble
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_whole_component
 
 METHOD = "printed"
 

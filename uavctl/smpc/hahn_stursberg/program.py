@@ -13,17 +13,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.smpc.answer import NOMINAL, Preview
+from uavctl.smpc.hahn_stursberg.components import Component
 from uavctl.smpc.hahn_stursberg.cones import ConicProgram, Expression, ProgramBuilder, join_rows
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Affine, Component, Horizon, terminal_bound
-from uavctl.smpc.qp import Pair, VariableLayout, find_pairs
-from uavctl.smpc.sets import NaturalSizes, Scale
+from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon, terminal_bound
+from uavctl.smpc.sets import NaturalSizes, Pair, Scale, find_pairs
+
+
+@dataclass(frozen=True)
+class VariableLayout:
+    """Slices of each kind of variable in the vector of all variables."""
+
+    v: slice
+    theta: slice
+    y: slice
+    offset: slice
+    slack: slice
+    miss: slice
+    outside: slice
+    backoff: slice
+
+    @property
+    def size(self) -> int:
+        """Number of variables."""
+        return int(self.backoff.stop)
+
+    @classmethod
+    def make(cls, v: int, theta: int, y: int, slack: int, miss: int, outside: int, backoff: int) -> VariableLayout:
+        """Place the given numbers of variables one after another."""
+        ends = np.cumsum([0, v, theta, y, y, slack, miss, outside, backoff]).tolist()
+        return cls(*(slice(i, j) for i, j in pairwise(ends)))
 
 
 class RestingPoint:
