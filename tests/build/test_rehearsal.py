@@ -60,10 +60,10 @@ def test_an_eight_that_the_inputs_do_not_allow_strays_by_its_figure() -> None:
         rehearse_preset(make_eight("room-px4", f"sets.input_lower=[-{m},-{m},-1.5]", f"sets.input_upper=[{m},{m},1.5]"))
         for m in (4.0, 1.0)
     )
-    assert not wide.strays
+    assert not wide.leaves_trajectory
     assert not wide.saturates
     assert wide.tracking_max_m is not None and wide.tracking_max_m < 0.02
-    assert narrow.strays
+    assert narrow.leaves_trajectory
     assert narrow.saturates
     assert narrow.left_mps2 == pytest.approx(0.4)  # less the 0.6 m/s² that are left to fly against wind
     assert narrow.tracking_max_m is not None and narrow.tracking_max_m > narrow.accept_m

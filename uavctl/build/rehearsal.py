@@ -64,7 +64,7 @@ class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
         return self.relaxed > self.allowed
 
     @property
-    def strays(self) -> bool:
+    def leaves_trajectory(self) -> bool:
         """Whether the trajectory cannot be followed to the accepted distance."""
         return self.tracking_max_m is not None and self.tracking_max_m > self.accept_m
 
@@ -93,7 +93,7 @@ class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
                 f"the trajectory asks for {self.asked_mps2:.1f} m/s² at {self.asked_s:.1f} s, the inputs leave "
                 f"{self.left_mps2:.1f} m/s²"
             )
-        if self.strays or self.saturates:
+        if self.leaves_trajectory or self.saturates:
             texts.append(
                 f"the model is up to {self.tracking_max_m:.2f} m from the trajectory ({self.tracking_m:.2f} m in the "
                 f"mean), mission.accept_m is {self.accept_m:g} m"
@@ -115,7 +115,7 @@ class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
                 "the back-offs for old positions leave no room: improve the link, widen [sets], lower smpc.delta_x or "
                 "the plant's wind_std_mps2"
             )
-        if self.strays or self.saturates:
+        if self.leaves_trajectory or self.saturates:
             texts.append("fly the trajectory slower, or widen sets.input_* and limits.accel_mps2 if the vehicle can")
         elif self.depends_on_drag:
             texts.append("measure the vehicle's drag with `uavctl tune`, or with `uavctl identify` from a recording")

@@ -245,7 +245,7 @@ def make_mission_items(config: Config, prepared: Prepared | None = None) -> tupl
     controller = build_controller(config, design) if prepared is None else prepared.controller
     assert isinstance(design, ConditionedDesign)
     result = rehearse(config, design, controller)
-    is_bad, is_noted = result.relaxes or result.strays, result.saturates or result.depends_on_drag
+    is_bad, is_noted = result.relaxes or result.leaves_trajectory, result.saturates or result.depends_on_drag
     state = ItemState.BAD if is_bad else ItemState.NOTE if is_noted else ItemState.GOOD
     value = ". ".join(result.sentences) or f"{result.seconds:g} s rehearsed, {result.relaxed:.0%} of the plans relax"
     want = "plans keep their constraints, and the trajectory to mission.accept_m"

@@ -125,7 +125,7 @@ def design(
         common.show(
             "design/conditioned", figures, lambda: render_conditioned(conditioned, loaded.config.name, rehearsal)
         )
-        return 1 if rehearsal is not None and (rehearsal.relaxes or rehearsal.strays) else 0
+        return 1 if rehearsal is not None and (rehearsal.relaxes or rehearsal.leaves_trajectory) else 0
     with locate_design_errors(loaded):
         paper_design = build_design(loaded.config)
     document = make_design_document(paper_design, time.perf_counter() - begin_s)
