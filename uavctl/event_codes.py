@@ -8,7 +8,7 @@ MISSION = "mission"  # subject: the mission is over, and the vehicle lands
 
 
 class EventCode(StrEnum):
-    """Code of an event. In brackets: the event's subject, where it has one."""
+    """Code of an event, and cause of a monitor's verdict. In brackets: the event's subject, where it has one."""
 
     # Answers to orders, one each, in their order
     ORDER_ACCEPTED = "order-accepted"  # [order]
@@ -30,6 +30,12 @@ class EventCode(StrEnum):
     VELOCITY = "envelope-velocity"  # positions move otherwise than the vehicle says
     SCATTER = "envelope-scatter"  # positions scatter more than the vehicle can move
     BRAKING = "envelope-braking"  # braking has no effect
+    # Causes to brake, or to distrust a source; no event of their own
+    POSITIONS_ABSURD = "positions-absurd"  # all positions are further out than any can be
+    PREDICTION_INCONSISTENT = "prediction-inconsistent"  # the vehicle moves otherwise than was predicted
+    SOURCE_MOVED = "positions-moved"  # refused positions agree for so long that their source has moved
+    CONTROLLER_LATE = "controller-late"  # a controller of another package takes too long
+    CONTROLLER_WALL = "controller-wall"  # it flies too fast towards a limit
     # Samples that the filter refuses
     SAMPLE_DUPLICATE = "sample-duplicate"
     SAMPLE_TOO_OLD = "sample-too-old"
@@ -55,7 +61,7 @@ class EventCode(StrEnum):
     BIAS_FREE = "bias-free"
     STRONG_PUSH = "strong-push"  # a wind or a hit, not a false position
     # Inertial data
-    INERTIAL_DOUBTED = "inertial-doubted"
+    INERTIAL_DOUBTED = "inertial-doubted"  # they contradict positions, the vehicle's velocity or the model
     INERTIAL_SILENT = "inertial-silent"
     INERTIAL_USED = "inertial-used"
     INERTIAL_STALE = "inertial-not-of-now"  # late, repeated, or frozen [connection]

@@ -22,8 +22,6 @@ from uavctl.config import Config
 from uavctl.errors import in_words
 from uavctl.event_codes import EventCode
 from uavctl.flight.controller import Controller
-from uavctl.flight.events import BIAS_AT_BOUND, BIAS_FREE, STRONG_PUSH
-from uavctl.flight.monitors.external import CONTROLLER_FAULT
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
@@ -71,10 +69,10 @@ MAX_ORDERS = 16  # that wait for a tick
 CONSOLE_CODES = frozenset(
     {
         EventCode.VEHICLE_TEXT,
-        BIAS_AT_BOUND,
-        BIAS_FREE,
-        STRONG_PUSH,
-        CONTROLLER_FAULT,
+        EventCode.BIAS_AT_BOUND,
+        EventCode.BIAS_FREE,
+        EventCode.STRONG_PUSH,
+        EventCode.CONTROLLER_FAULT,
         EventCode.HUNG_UP,
         EventCode.CONNECTION_SILENT,
         EventCode.NO_HEARTBEAT,

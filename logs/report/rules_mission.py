@@ -24,7 +24,6 @@ from logs.report.verdict_risk import Flags
 from uavctl.arrays import Array
 from uavctl.cause import BAD, CAUTION, Cause
 from uavctl.event_codes import EventCode
-from uavctl.flight.monitors.stale import FROZEN
 from uavctl.records import ControlMode, Severity
 
 _MAX_RMS_SHARE = 0.5  # of the radius of arrival: root mean square distance that a mission of places may have on average
@@ -70,7 +69,7 @@ def find_bad_ending(e: FlightEvidence) -> Iterator[Finding]:
 def find_failed_takeoff(e: FlightEvidence) -> Iterator[Finding]:
     """Find that the vehicle was armed on the ground and never left it, by the positions that came."""
     began_landed = next((status.landed for status in e.flight.vehicles if status.landed is not None), False)
-    if not began_landed or not e.armed_spans or e.count_refused(FROZEN)[0]:
+    if not began_landed or not e.armed_spans or e.count_refused(EventCode.SAMPLE_FROZEN)[0]:
         return
     end_s = e.to_seconds(e.flight.decisions[-1].at_ns)
     begun_s, lasted_s = e.armed_spans[0][0], sum(min(end, end_s) - begin for begin, end in e.armed_spans)

@@ -13,10 +13,6 @@ from logs.report.findings import Finding, metres, seconds
 from logs.report.rules_loss import NEGLIGIBLE_COUNT, NEGLIGIBLE_SHARE, WRONG_POSITION_M
 from uavctl.cause import BAD, CAUTION, Cause
 from uavctl.event_codes import EventCode
-from uavctl.flight.estimator import DUPLICATE, TOO_OLD
-from uavctl.flight.measure import FUTURE, INVALID
-from uavctl.flight.monitors.outliers import JUMP
-from uavctl.flight.monitors.stale import FROZEN
 from uavctl.mavlink.clocksync import StampRefusal
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.mavlink.relay import HELD_BACK, REASONS
@@ -25,10 +21,14 @@ _MAX_DRIFT_STEP_M = 0.1  # what a drifting source adds from one position to the 
 _UNUSABLE_SHARE = 0.2  # of positions: more than come out of order, or twice, on any link
 _RELAY_TIMEOUT_S = 2.0  # without a position passed on: vehicles' estimators give up after 5 to 7 s
 _SAMPLE_CAUSES = (
-    (Cause.POSITIONS_FROZEN, (FROZEN,), "the camera sent the same position again and again"),
-    (Cause.POSITIONS_JUMPED, (JUMP,), "positions were where the vehicle cannot have been"),
-    (Cause.STAMPS_UNUSABLE, (FUTURE, TOO_OLD, DUPLICATE), "stamps lay in the future, were too old or came twice"),
-    (Cause.POSITIONS_INVALID, (INVALID,), "positions were no finite numbers, or absurd"),
+    (Cause.POSITIONS_FROZEN, (EventCode.SAMPLE_FROZEN,), "the camera sent the same position again and again"),
+    (Cause.POSITIONS_JUMPED, (EventCode.SAMPLE_JUMP,), "positions were where the vehicle cannot have been"),
+    (
+        Cause.STAMPS_UNUSABLE,
+        (EventCode.SAMPLE_FUTURE, EventCode.SAMPLE_TOO_OLD, EventCode.SAMPLE_DUPLICATE),
+        "stamps lay in the future, were too old or came twice",
+    ),
+    (Cause.POSITIONS_INVALID, (EventCode.SAMPLE_INVALID,), "positions were no finite numbers, or absurd"),
 )
 
 
@@ -60,7 +60,7 @@ def _find_unusable_stamps(e: FlightEvidence) -> Iterator[Finding]:
 def find_wrong_positions(e: FlightEvidence) -> Iterator[Finding]:
     """Find positions that were used, or came, and were not where the vehicle was, by the truth."""
     is_wrong = e.position_error_m > WRONG_POSITION_M
-    if np.count_nonzero(is_wrong) <= NEGLIGIBLE_COUNT or e.count_refused(FROZEN)[0] > NEGLIGIBLE_COUNT:
+    if np.count_nonzero(is_wrong) <= NEGLIGIBLE_COUNT or e.count_refused(EventCode.SAMPLE_FROZEN)[0] > NEGLIGIBLE_COUNT:
         return
     worst, first = int(e.position_error_m.argmax()), int(np.flatnonzero(is_wrong)[0])
     steps_m = np.abs(np.diff(e.position_error_m[: first + 1]))

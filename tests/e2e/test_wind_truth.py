@@ -14,11 +14,10 @@ from sim.simulation import World
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.build.controller import build_envelope, build_plant
 from uavctl.config import load_config
-from uavctl.flight.events import STRONG_PUSH
+from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState, update
 from uavctl.flight.monitors.observation import Observation
-from uavctl.flight.monitors.verdict import Cause
 from uavctl.flight.supervise import OF_POSITIONS, RELEASES
 from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.lab.trial import TrackedFlyer, compute_excess_m, get_cached_controller, get_room_limits
@@ -148,8 +147,8 @@ def test_a_wind_that_the_vehicle_can_hold_is_held(autopilot: str, push_mps2: Vec
 @pytest.mark.fault(72)
 def test_a_wind_that_it_cannot_hold_lets_it_land_by_its_positions(autopilot: str) -> None:
     flight = fly_in_wind(autopilot, (6.0, 0.0, 0.0))
-    assert flight.let_go_s is not None and set(flight.codes) & {Cause.OUTSIDE, Cause.BRAKING}
-    assert not OF_POSITIONS & set(flight.codes) and STRONG_PUSH in flight.codes
+    assert flight.let_go_s is not None and set(flight.codes) & {EventCode.OUTSIDE, EventCode.BRAKING}
+    assert not OF_POSITIONS & set(flight.codes) and EventCode.STRONG_PUSH in flight.codes
     after = [at_s for at_s in flight.relayed_s if flight.let_go_s < at_s < flight.let_go_s + 3.0]
     assert len(after) > 20 and max(np.diff([flight.let_go_s, *after])) < 1.0
 
@@ -239,7 +238,7 @@ def watch_envelope(*, feels: bool) -> tuple[MonitorState, str | None, float]:
 def test_a_recorded_wind_that_px4_held_is_no_false_position_by_its_inertial_data() -> None:
     """Its client of then looked at positions and setpoints alone, and let it go after 13.4 s."""
     blind, code, at_s = watch_envelope(feels=False)
-    assert code == Cause.RESPONSE and at_s == pytest.approx(13.4, abs=0.1) and not blind.acceleration.is_pushed
+    assert code == EventCode.RESPONSE and at_s == pytest.approx(13.4, abs=0.1) and not blind.acceleration.is_pushed
     felt, none, end_s = watch_envelope(feels=True)
     assert none is None and end_s >= at_s
     assert felt.acceleration.is_pushed and felt.motion.push_mps2[0] == pytest.approx(-1.7, abs=0.3)

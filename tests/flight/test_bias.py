@@ -33,9 +33,9 @@ from scipy.linalg import expm
 from uavctl.build.controller import build_controller, build_design, build_spec
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
+from uavctl.event_codes import EventCode
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
-from uavctl.flight.events import BIAS_AT_BOUND, BIAS_FREE
 from uavctl.flight.kalman import make_kalman
 from uavctl.flight.tick import make_initial_state
 from uavctl.flight.tick import tick as run_tick
@@ -141,7 +141,9 @@ class _Biased:
                 self.places.append(self.x[list(plant.position_index)])
             inp = StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=vehicle())
             self.state, output = run_tick(self.state, inp, self.controller)
-            self.events += [event.code for event in output.events if event.code in (BIAS_AT_BOUND, BIAS_FREE)]
+            self.events += [
+                event.code for event in output.events if event.code in (EventCode.BIAS_AT_BOUND, EventCode.BIAS_FREE)
+            ]
             u = np.zeros(plant.n_u) if output.setpoint is None else plant.to_input(output.setpoint.accel_mps2)
             self.inputs.append(u)
             self.x = a @ self.x + b @ (u + self.bias)
@@ -177,10 +179,10 @@ def test_a_push_within_the_authority_is_flown_against_and_one_at_its_bound_is_to
     away_m = abs(float(world.places[-1][0]) - config.target.position_m[0])
     told = share == 0.0
     assert (away_m > 0.05) == told and away_m < most_m
-    assert world.events == [BIAS_AT_BOUND] * told
+    assert world.events == [EventCode.BIAS_AT_BOUND] * told
     world.bias = np.zeros(3)
     world.fly(75)
-    assert world.events == [BIAS_AT_BOUND, BIAS_FREE] * told
+    assert world.events == [EventCode.BIAS_AT_BOUND, EventCode.BIAS_FREE] * told
 
 
 def test_plans_leave_room_for_it_and_what_is_flown_keeps_the_input_limits() -> None:

@@ -15,12 +15,13 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.acceleration import compute_lean_mps2
 from uavctl.flight.monitors.engaged import INITIAL
 from uavctl.flight.monitors.observation import Observation, select_axes
 from uavctl.flight.monitors.outside import describe_beyond, is_outside
-from uavctl.flight.monitors.verdict import Cause, Verdict
+from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
 
 # The limits
@@ -31,7 +32,7 @@ def at(position: Vec3 | None, velocity: Vec3 = ZERO, *, since_ns: int | None = A
     ours = structs.replace(seen(AT_NS), position_m=position, velocity_mps=velocity)
     watching, breach = update(monitors(outside_ns=since_ns), ours, PARAMETERS)
     assert is_outside(ours, PARAMETERS) == (watching.outside.since_ns is not None)
-    assert breach is None or (breach.cause == Cause.OUTSIDE and watching.outside.since_ns == since_ns)
+    assert breach is None or (breach.cause == EventCode.OUTSIDE and watching.outside.since_ns == since_ns)
     return breach
 
 
@@ -147,7 +148,7 @@ def braked(speeds: Iterator[tuple[int, float | None]], *, ends: Sequence[int] = 
 def test_braking_has_to_show(speeds: list[tuple[int, float | None]], ends: tuple[int, ...], found: list[int]) -> None:
     breaches = braked(iter(speeds), ends=ends)
     assert [at_ms for at_ms, _ in breaches] == found
-    assert {breach.cause for _, breach in breaches} <= {Cause.BRAKING}
+    assert {breach.cause for _, breach in breaches} <= {EventCode.BRAKING}
 
 
 @pytest.mark.parametrize(("for_ns", "breached"), [(10**9 - 1, False), (10**9, True), (10**9 + 1, True)])
@@ -173,7 +174,7 @@ def test_positions_that_come_back_correct_its_own_velocity_and_begin_braking_ane
             watching, structs.replace(seen(at_ns, *taken, vehicle_motion=own), braking=True), parameters
         )
         if breach is not None:
-            assert breach.cause == Cause.BRAKING
+            assert breach.cause == EventCode.BRAKING
             breaches.append(now_ms)
     assert breaches[:1] == found
 
@@ -254,7 +255,7 @@ def test_a_breach_tells_whether_the_vehicle_leans_as_it_was_told(
         pitch = -math.atan(lean[0] / 9.81)
         own = VehicleMotion(attitude_rad=(math.atan(lean[1] / 9.81 * math.cos(pitch)), pitch, 0.0), attitude_ns=AT_NS)
     _, breach = look(unexplained, accel=(1.0, 0.0, 0.0), vehicle_motion=own)
-    assert breach is not None and breach.cause == Cause.RESPONSE
+    assert breach is not None and breach.cause == EventCode.RESPONSE
     assert breach.text.endswith(words) and ("leans" in breach.text) == bool(words)
 
 
@@ -316,7 +317,7 @@ Camera = Callable[[float, Array], Array]  # time, true position -> what it says
 
 def fly(
     camera: Camera, *, drag_1ps: float = 0.3, own: bool = False, accel_mps2: float = 2.0, stall: range = range(0)
-) -> tuple[float, float, Cause | None] | None:
+) -> tuple[float, float, EventCode | None] | None:
     """A vehicle is sent to and fro, by `expm`, for 10 s: (time, largest true distance so far, code) of a breach."""
     rng = np.random.default_rng(2)
     parameters = replace(PARAMETERS, unexplained_mps2=1.5, lag_s=(0.25, 0.25, 0.25), lower_m=(-99.0,) * 3)
@@ -380,7 +381,7 @@ def test_frames_that_do_not_fit_and_loose_markers_are_found_before_the_vehicle_i
     found = fly(camera, own=own)
     assert found is not None
     assert found[1] < 1.0
-    assert found[2] in {Cause.RESPONSE, Cause.VELOCITY, Cause.SCATTER}
+    assert found[2] in {EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER}
 
 
 @pytest.mark.fault(42)

@@ -37,12 +37,12 @@ from msgspec import structs
 from scipy.linalg import expm
 
 from uavctl.arrays import SECOND_NS
+from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity
-from uavctl.flight.monitors.verdict import Cause
 from uavctl.flight.supervise import RELEASES
 from uavctl.records import Vec3, VehicleMotion
 
@@ -209,7 +209,7 @@ def test_an_acceleration_beyond_the_bound_has_to_persist_and_a_plain_one_has_not
         assert watching.acceleration.unexplained_mps2 == abs(unexplained_mps2)
         assert watching.acceleration.over_ns == since_ns
         assert (breach is not None) == breached
-        assert breach is None or breach.cause == Cause.RESPONSE
+        assert breach is None or breach.cause == EventCode.RESPONSE
 
 
 @pytest.mark.parametrize(
@@ -250,7 +250,7 @@ def test_three_of_five_positions_that_are_far_off_are_no_chance(
 ) -> None:
     watching, breach = look(ZERO, off_m=off_m, clipped=before)
     assert watching.acceleration.clipped == (*before, off_m > 0.15)[-5:]
-    assert (None if breach is None else breach.cause) == (Cause.SCATTER if breached else None)
+    assert (None if breach is None else breach.cause) == (EventCode.SCATTER if breached else None)
 
 
 def test_an_innovation_counts_up_to_six_standard_deviations() -> None:
@@ -591,7 +591,7 @@ def plain(watching: MonitorState) -> Any:
 
 def test_what_time_it_is_makes_no_difference() -> None:
     """The same flights under a clock whose zero is long after them, and under one whose zero is as they begin."""
-    found: set[Cause | None] = set()
+    found: set[EventCode | None] = set()
     for seed in range(6):
         by_ns = MS - START_NS if seed % 3 == 2 else -1000 * SECOND_NS
         rng, at_ns = np.random.default_rng(seed), START_NS + 1
@@ -610,4 +610,8 @@ def test_what_time_it_is_makes_no_difference() -> None:
             for says in (trusted_velocity, is_prediction_inconsistent):
                 assert says(two, same_tick, 0.1, PARAMETERS) == says(one, tick, 0.1, PARAMETERS)
             at_ns += int(rng.choice([int(rng.integers(30, 90)), 400, 3500], p=[0.96, 0.03, 0.01])) * MS
-    assert found == RELEASES == {Cause.RESPONSE, Cause.VELOCITY, Cause.SCATTER, Cause.OUTSIDE, Cause.BRAKING}
+    assert (
+        found
+        == RELEASES
+        == {EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER, EventCode.OUTSIDE, EventCode.BRAKING}
+    )

@@ -28,11 +28,12 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 
 from uavctl.arrays import SECOND_NS
+from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.velocity import VelocityState
-from uavctl.flight.monitors.verdict import Cause, Verdict
+from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
 
 
@@ -129,7 +130,7 @@ def test_velocities_that_contradicted_each_other_and_then_no_position_comes(
     since_ns: int | None, breached: bool
 ) -> None:
     _, breach = update(monitors(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, vehicle_motion=AT_REST), PARAMETERS)
-    assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
+    assert (None if breach is None else breach.cause) == (EventCode.VELOCITY if breached else None)
 
 
 def test_a_velocity_that_is_contradicted_is_not_agreed_with() -> None:
@@ -182,7 +183,7 @@ def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within
     for off_m, breached in ((min(within_m, 99.0) - 1e-6, False), (within_m + 1e-6, True)):
         watching, breach = creeping(off_m if math.isfinite(off_m) else 99.0, age_ns)
         breached = breached and math.isfinite(within_m)
-        assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
+        assert (None if breach is None else breach.cause) == (EventCode.VELOCITY if breached else None)
         assert not watching.velocity.is_contradicted
 
 
@@ -195,7 +196,7 @@ def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
 
 def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
     _, breach = creeping(9.0, SECOND_NS, before=3)
-    assert breach is not None and breach.cause == Cause.VELOCITY
+    assert breach is not None and breach.cause == EventCode.VELOCITY
 
 
 @pytest.mark.parametrize(
@@ -243,9 +244,9 @@ def test_over_a_gap_the_way_is_not_compared() -> None:
 def test_a_contradiction_is_reported_before_scatter_and_after_an_unexplained_acceleration() -> None:
     contradicts = offsets(9.0)
     _, scattered = look(ZERO, off_m=9.0, vehicle_motion=AT_REST, clipped=(True, True), **contradicts)
-    assert scattered is not None and scattered.cause == Cause.VELOCITY
+    assert scattered is not None and scattered.cause == EventCode.VELOCITY
     _, unexplained = look((9.0, 0.0, 0.0), vehicle_motion=AT_REST, **contradicts)
-    assert unexplained is not None and unexplained.cause == Cause.RESPONSE
+    assert unexplained is not None and unexplained.cause == EventCode.RESPONSE
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
@@ -294,7 +295,7 @@ def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plai
     assert watching.velocity.apart_mps == EXACT_MPS
     assert watching.velocity.apart_ns == since_ns
     assert watching.velocity.is_contradicted == (since_ns is not None)
-    assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
+    assert (None if breach is None else breach.cause) == (EventCode.VELOCITY if breached else None)
 
 
 def test_the_way_is_known_between_ticks_and_not_before_the_first() -> None:
@@ -395,7 +396,7 @@ def test_the_first_second_of_positions_after_a_silence_corrects_the_vehicle_s_ow
         taken = () if 3000 < now_ms < back_ms else (sample(at_ns, at_ns, ZERO),)
         watching, breach = update(watching, seen(at_ns, *taken, vehicle_motion=own), parameters)
         if breach is not None:
-            assert breach.cause == Cause.VELOCITY
+            assert breach.cause == EventCode.VELOCITY
             found_ms.append(now_ms - back_ms)
     assert bool(found_ms) == found
     if found:

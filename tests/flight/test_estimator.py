@@ -23,9 +23,8 @@ from msgspec.structs import replace as changed
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import (
-    DUPLICATE,
-    TOO_OLD,
     FilterHistory,
     absorb_samples,
     advance_window,
@@ -339,10 +338,10 @@ def test_duplicates_and_samples_beyond_the_window_are_refused_with_the_reason() 
         kalman, history, at_ns, [good, good, same_time_elsewhere, old, just_young_enough]
     )
     assert taken == (good, same_time_elsewhere, just_young_enough)
-    assert refused == (DUPLICATE, TOO_OLD)
+    assert refused == (EventCode.SAMPLE_DUPLICATE, EventCode.SAMPLE_TOO_OLD)
     before = estimate_at(kalman, history, at_ns)
     history, taken, refused = absorb_samples(kalman, history, at_ns, [good])
-    assert (taken, refused) == ((), (DUPLICATE,))
+    assert (taken, refused) == ((), (EventCode.SAMPLE_DUPLICATE,))
     assert estimate_at(kalman, history, at_ns) == before
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.inertial import (
     UNUSED,
     InertialObservation,
@@ -16,7 +17,7 @@ from uavctl.flight.monitors.inertial import (
     is_plausible,
     update,
 )
-from uavctl.flight.monitors.verdict import Action, Cause, Verdict
+from uavctl.flight.monitors.verdict import Action, Verdict
 
 S = 1_000_000_000
 SINCE_NS = 5 * S
@@ -26,7 +27,9 @@ def compare(trust: InertialTrust, source: Source, agrees: bool, at_ns: int, capt
     """The state after a comparison; a verdict comes if and only if distrust begins."""
     after, verdict = update(trust, InertialObservation(source, agrees, at_ns, captured_ns))
     begins = trust.distrusted_ns is None and after.distrusted_ns is not None
-    assert verdict == (Verdict(Action.DISTRUST_INERTIAL, Cause.INERTIAL, since_ns=at_ns) if begins else Verdict())
+    assert verdict == (
+        Verdict(Action.DISTRUST_INERTIAL, EventCode.INERTIAL_DOUBTED, since_ns=at_ns) if begins else Verdict()
+    )
     assert verdict.is_none != begins
     return after
 

@@ -13,13 +13,13 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 
 from uavctl.arrays import SECOND_NS, Array
+from uavctl.event_codes import EventCode
 from uavctl.flight.monitors import acceleration
 from uavctl.flight.monitors.acceleration import AccelerationState, describe_acceleration, describe_push
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import InertialSpan, Observer, extend_path, move_along
-from uavctl.flight.monitors.verdict import Cause
 from uavctl.records import Vec3, VehicleMotion
 
 BOUND_MPS2 = PARAMETERS.unexplained_mps2
@@ -124,13 +124,13 @@ def test_a_wind_that_inertial_data_show_is_no_false_position(wind: str, drag_1ps
         flown = fly(WINDS[wind], drag_1ps=drag_1ps, seed=seed)
         assert flown.code == ""
     without = fly(WINDS[wind], drag_1ps=drag_1ps, shown=lambda t, accel: None)
-    assert without.code == Cause.RESPONSE
+    assert without.code == EventCode.RESPONSE
 
 
 @pytest.mark.fault(71)
 def test_a_hit_that_inertial_data_show_is_no_false_position() -> None:
     assert fly(hit(25.0)).code == ""
-    assert fly(hit(25.0), shown=lambda t, accel: None).code == Cause.RESPONSE
+    assert fly(hit(25.0), shown=lambda t, accel: None).code == EventCode.RESPONSE
 
 
 @pytest.mark.fault(71)
@@ -155,10 +155,10 @@ def test_positions_of_a_wrong_frame_are_found_with_inertial_data_as_without(
 ) -> None:
     blows = WINDS.get(wind, steady(0.0))
     with_data = fly(blows, frame=frame, from_s=from_s)
-    assert with_data.code == Cause.RESPONSE
+    assert with_data.code == EventCode.RESPONSE
     if wind == "calm":
         without = fly(blows, frame=frame, from_s=from_s, shown=lambda t, accel: None)
-        assert without.code == Cause.RESPONSE and with_data.at_s <= without.at_s + 0.3
+        assert without.code == EventCode.RESPONSE and with_data.at_s <= without.at_s + 0.3
     else:
         assert from_s < with_data.at_s < from_s + 5.0
 
@@ -181,7 +181,7 @@ def test_inertial_data_that_are_wrong_let_no_flight_go_and_hide_no_wrong_frame(
 ) -> None:
     assert fly(steady(0.5), shown=lie).code == ""
     found = fly(steady(0.5), shown=lie, frame=turned(180.0), from_s=4.0)
-    assert found.code == Cause.RESPONSE and found.at_s < 9.0
+    assert found.code == EventCode.RESPONSE and found.at_s < 9.0
 
 
 @pytest.mark.fault(71)
@@ -191,8 +191,8 @@ def test_a_silence_of_inertial_data_goes_on_with_the_wind_that_they_showed() -> 
 
     assert fly(steady(3.0), shown=silent).code == ""
     # Nothing else is excused by it: not a frame that turns, nor a wind that comes then.
-    assert fly(steady(3.0), shown=silent, frame=turned(180.0), from_s=5.5).code == Cause.RESPONSE
-    assert fly(steady(5.0, from_s=6.0), shown=silent).code == Cause.RESPONSE
+    assert fly(steady(3.0), shown=silent, frame=turned(180.0), from_s=5.5).code == EventCode.RESPONSE
+    assert fly(steady(5.0, from_s=6.0), shown=silent).code == EventCode.RESPONSE
 
 
 def test_the_way_is_the_double_integral_of_its_spans() -> None:

@@ -23,8 +23,9 @@ from flight_rig import (
 )
 from msgspec import structs
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.controller import Controller
-from uavctl.flight.monitors.external import CONTROLLER_FAULT, LATE_IN_A_ROW, LONGEST_ANSWER_NS
+from uavctl.flight.monitors.external import LATE_IN_A_ROW, LONGEST_ANSWER_NS
 from uavctl.flight.tick import TickOutput
 from uavctl.records import ControlMode, SolveStatus, StepInput
 from uavctl.smpc.answer import Answer
@@ -42,7 +43,7 @@ def flown_by(solver: StubSolver) -> Controller:
 
 
 def told(outputs: list[TickOutput]) -> list[str]:
-    return [event.text for one in outputs for event in one.events if event.code == CONTROLLER_FAULT]
+    return [event.text for one in outputs for event in one.events if event.code == EventCode.CONTROLLER_FAULT]
 
 
 def timed(inputs: list[StepInput], took_ns: dict[int, int]) -> list[StepInput]:
@@ -56,7 +57,7 @@ def test_one_that_fails_is_braked_at_once_told_once_and_landed() -> None:
     fell = outputs[8 * TICKS]
     assert fell.decision.mode is ControlMode.BRAKE and fell.decision.reason == WHY
     assert fell.decision.solve is SolveStatus.FAILED
-    assert set(list_codes(fell)) == {CONTROLLER_FAULT, "fallback-brake"}
+    assert set(list_codes(fell)) == {EventCode.CONTROLLER_FAULT, "fallback-brake"}
     assert told(outputs) == [WHY]
     after = list_modes(outputs[8 * TICKS :])
     assert ControlMode.TRACK not in after and after[-1] is ControlMode.STOPPED

@@ -11,6 +11,7 @@ from msgspec import structs
 from scipy.integrate import quad
 
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.monitors.outliers import (
@@ -23,7 +24,7 @@ from uavctl.flight.monitors.outliers import (
     make_reach,
     update,
 )
-from uavctl.flight.monitors.verdict import Action, Cause
+from uavctl.flight.monitors.verdict import Action
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
 LIMITS = LimitsParameters(accel_mps2=(2.0, 9.0, 1.5), slew_mps3=1.0)
@@ -93,7 +94,7 @@ def judge(
 ) -> tuple[bool, OutlierTrack | None]:
     """Whether a sample is believed, and the samples that are suspected after it."""
     after, verdict = update(track, OutlierObservation(at_ns, offset, width, n_axes))
-    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.DISTRUST_POSITIONS, Cause.JUMP)
+    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.DISTRUST_POSITIONS, EventCode.SAMPLE_JUMP)
     return verdict.is_none, after
 
 

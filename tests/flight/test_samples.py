@@ -10,10 +10,10 @@ import pytest
 from flight_rig import HORIZON, MS, START_NS, TICK_NS, make_controller, sample, vehicle
 from msgspec import structs
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import LATEST_STAMP_NS, begin_history, note_input
 from uavctl.flight.measure import GatedSamples, gate_samples
 from uavctl.flight.monitors.outliers import GateParameters
-from uavctl.flight.monitors.stale import FROZEN, REPEATED
 from uavctl.flight.state import SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleMotion
 
@@ -147,7 +147,7 @@ def test_what_a_stuck_source_said_again_is_taken_back() -> None:
     back = [tick for tick, one in enumerate(found) if one.clean_ns is not None]
     assert len(back) == 1
     (tick,) = back
-    assert refused_as(found[tick]) == {FROZEN}
+    assert refused_as(found[tick]) == {EventCode.SAMPLE_FROZEN}
     believed = [n for n in range(13, tick) if found[n].accepted]
     assert believed  # or there was nothing to take back
     assert found[tick].clean_ns == START_NS + 12 * TICK_NS
@@ -156,7 +156,7 @@ def test_what_a_stuck_source_said_again_is_taken_back() -> None:
     never = pushed({"stuck": 12}, 40, believes=False)
     assert repr(found[tick].history) == repr(never[tick].history)
     for one in found[tick + 1 :]:
-        assert (refused_as(one), one.clean_ns, one.accepted) == ({FROZEN}, None, ())
+        assert (refused_as(one), one.clean_ns, one.accepted) == ({EventCode.SAMPLE_FROZEN}, None, ())
     assert repr(found[-1].history) == repr(never[-1].history)
 
 
@@ -175,7 +175,7 @@ def test_what_a_stuck_source_said_again_is_taken_back() -> None:
 )
 def test_who_says_that_it_rests_may_be_where_it_was(own: Vec3 | None, at_rest_mps: float, believed: bool) -> None:
     found = pushed({"stuck": 12}, 40, own=own, at_rest_mps=at_rest_mps)
-    assert any(FROZEN in refused_as(one) for one in found) != believed
+    assert any(EventCode.SAMPLE_FROZEN in refused_as(one) for one in found) != believed
 
 
 def test_what_others_said_meanwhile_is_kept() -> None:
@@ -211,7 +211,7 @@ def test_a_stale_value_whose_first_sample_was_lost_is_taken_back_as_soon_as_it_c
     found, never = flown_on({**BEFORE, 14: stale, 15: stale}, 18), flown_on(BEFORE, 18)
     assert found[14].accepted
     assert found[14].history.captured_ns == START_NS + 14 * TICK_NS
-    assert refused_as(found[15]) == {REPEATED}
+    assert refused_as(found[15]) == {EventCode.SAMPLE_REPEATED}
     # The newest position that is left: a plan made since is outdated by it.
     assert found[15].clean_ns == START_NS + 9 * TICK_NS
     assert found[15].history.captured_ns == START_NS + 9 * TICK_NS
@@ -221,7 +221,7 @@ def test_a_stale_value_whose_first_sample_was_lost_is_taken_back_as_soon_as_it_c
 
 def test_a_value_whose_first_sample_cannot_have_been_lost_stays() -> None:
     found = flown_on({**BEFORE, 10: BEFORE[9] + 0.03, 15: BEFORE[9] + 0.03}, 16)
-    assert refused_as(found[15]) == {REPEATED}
+    assert refused_as(found[15]) == {EventCode.SAMPLE_REPEATED}
     assert found[15].clean_ns is None
     assert found[15].history.captured_ns == START_NS + 10 * TICK_NS
 
@@ -229,7 +229,7 @@ def test_a_value_whose_first_sample_cannot_have_been_lost_stays() -> None:
 def test_the_first_value_of_all_is_watched_and_stays_where_nothing_else_is_known() -> None:
     found = flown_on({0: 0.0, 18: 0.0}, 19)
     assert found[0].sources.records["camera"].first_ns == START_NS
-    assert refused_as(found[18]) <= {REPEATED, FROZEN}
+    assert refused_as(found[18]) <= {EventCode.SAMPLE_REPEATED, EventCode.SAMPLE_FROZEN}
     assert refused_as(found[18])
     assert found[18].history.captured_ns == START_NS
     assert found[18].clean_ns is None

@@ -26,10 +26,11 @@ from flight_rig import (
 )
 from msgspec.structs import replace
 
+from uavctl.event_codes import EventCode
 from uavctl.flight import measure
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import Fallback, FallbackEnd
-from uavctl.flight.monitors.verdict import Cause, release
+from uavctl.flight.monitors.verdict import release
 from uavctl.flight.state import ControlState, FallbackGroup, MonitorGroup
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import tick as run_tick
@@ -51,7 +52,7 @@ def fly(ours: Controller, status: VehicleStatus | None, position_m: Vec3 = MILLI
     times_ns = [START_NS + n * 2 * TICK_NS for n in range(N_TICKS // 2)]
     said = [sample(at_ns, position_m=position_m) for at_ns in times_ns]
     outputs = run(ours, make_inputs(range(N_TICKS), said, status=lambda tick: status))
-    found = [event.code for output in outputs for event in output.events if event.code == Cause.OUTSIDE]
+    found = [event.code for output in outputs for event in output.events if event.code == EventCode.OUTSIDE]
     assert len(found) == (ControlMode.LAND in list_modes(outputs))
     assert sum(output.land for output in outputs) == len(found)
     return list_modes(outputs)
@@ -140,22 +141,22 @@ def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit
 @pytest.mark.parametrize(
     ("cause", "for_ns", "silent"),
     [
-        (Cause.RESPONSE, 9_000 * MS, True),
-        (Cause.VELOCITY, 9_000 * MS, True),
-        (Cause.SCATTER, 9_000 * MS, True),
-        (Cause.OUTSIDE, 1_999 * MS, True),  # positions may be the reason
-        (Cause.OUTSIDE, 2_000 * MS, False),  # it is outside
-        (Cause.BRAKING, 2_000 * MS, False),
-        (Cause.OUTSIDE, None, True),
+        (EventCode.RESPONSE, 9_000 * MS, True),
+        (EventCode.VELOCITY, 9_000 * MS, True),
+        (EventCode.SCATTER, 9_000 * MS, True),
+        (EventCode.OUTSIDE, 1_999 * MS, True),  # positions may be the reason
+        (EventCode.OUTSIDE, 2_000 * MS, False),  # it is outside
+        (EventCode.BRAKING, 2_000 * MS, False),
+        (EventCode.OUTSIDE, None, True),
     ],
 )
-def test_what_is_not_believed_is_told_to_nobody(cause: Cause, for_ns: int | None, silent: bool) -> None:
+def test_what_is_not_believed_is_told_to_nobody(cause: EventCode, for_ns: int | None, silent: bool) -> None:
     began_ns = None if for_ns is None else START_NS - for_ns
     engaged = monitors(tick_ns=START_NS, began_ns=began_ns)
     group = MonitorGroup(engaged=engaged, release=release(cause, ""))
     assert distrusts_positions(ControlState(monitors=group)) == silent
     agreed = replace(group, engaged=replace(engaged, agreed=True))
-    assert distrusts_positions(ControlState(monitors=agreed)) == (silent and cause is not Cause.OUTSIDE)
+    assert distrusts_positions(ControlState(monitors=agreed)) == (silent and cause is not EventCode.OUTSIDE)
 
 
 @pytest.mark.parametrize("senses", [True, False])
@@ -188,7 +189,7 @@ def test_what_jumped_is_told_to_nobody(end: FallbackEnd, silent: bool) -> None:
     flown = FallbackGroup(flown=fallback)
     assert distrusts_positions(ControlState(fallback=flown)) == silent
     old = monitors(tick_ns=START_NS, began_ns=START_NS - 9_000 * MS)
-    outside = MonitorGroup(engaged=old, release=release(Cause.OUTSIDE, ""))
+    outside = MonitorGroup(engaged=old, release=release(EventCode.OUTSIDE, ""))
     assert distrusts_positions(ControlState(fallback=flown, monitors=outside)) == silent
     assert not distrusts_positions(ControlState())
 

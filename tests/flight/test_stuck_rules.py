@@ -9,6 +9,7 @@ import pytest
 from flight_rig import DT_NS, MS, START_NS, TICK_NS, estimator_parameters, sample, small_plant
 from msgspec.structs import replace
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import absorb_samples, begin_history, note_input
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.monitors.outliers import GateParameters
@@ -22,7 +23,6 @@ from uavctl.flight.monitors.stale import (
     record_sample,
     update,
 )
-from uavctl.flight.monitors.verdict import Cause
 from uavctl.records import PositionSample
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
@@ -385,7 +385,7 @@ def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_to
 
 def judged(
     inputs_mps2: list[float], *, is_flying: bool = True, late_ns: int = 0, next_m: float = 0.02
-) -> list[tuple[Cause | None, float]]:
+) -> list[tuple[EventCode | None, float]]:
     """Verdicts on a value that comes again with each input, and the position that inputs alone predict [m].
 
     Args:
@@ -412,10 +412,13 @@ def judged(
 
 @pytest.mark.parametrize(
     ("inputs_mps2", "within_m", "cause"),
-    [([4.0] * 2 + [-4.0] * 12, 0.015, Cause.REPEATED), ([4.0] * 8 + [-4.0] * 25, 0.1, Cause.FROZEN)],
+    [
+        ([4.0] * 2 + [-4.0] * 12, 0.015, EventCode.SAMPLE_REPEATED),
+        ([4.0] * 8 + [-4.0] * 25, 0.1, EventCode.SAMPLE_FROZEN),
+    ],
 )
 def test_a_source_that_was_found_out_is_not_believed_though_inputs_come_back_to_its_value(
-    inputs_mps2: list[float], within_m: float, cause: Cause
+    inputs_mps2: list[float], within_m: float, cause: EventCode
 ) -> None:
     last, predicted_m = judged(inputs_mps2)[-1]
     assert predicted_m == pytest.approx(0.02, abs=within_m)  # so near that this repeat alone is no reason
@@ -425,5 +428,5 @@ def test_a_source_that_was_found_out_is_not_believed_though_inputs_come_back_to_
 
 def test_a_vehicle_on_the_ground_may_repeat_its_value_and_a_late_sample_says_nothing() -> None:
     assert {cause for cause, _ in judged([4.0] * 20, is_flying=False)} == {None}
-    assert judged([4.0] * 20)[-1][0] == Cause.FROZEN
+    assert judged([4.0] * 20)[-1][0] == EventCode.SAMPLE_FROZEN
     assert judged([4.0] * 20, late_ns=TICK_NS + MS)[-1][0] is None

@@ -11,6 +11,7 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import engaged
 from uavctl.flight.monitors.braking import BrakingState
@@ -25,7 +26,7 @@ from uavctl.flight.monitors.vehicle_velocity import (
     judge_prediction,
     judge_vehicle_velocity,
 )
-from uavctl.flight.monitors.verdict import Action, Cause, Verdict
+from uavctl.flight.monitors.verdict import Action, Verdict
 from uavctl.flight.supervise import RELEASES
 from uavctl.records import PositionSample, Vec3, VehicleMotion
 
@@ -106,7 +107,7 @@ def is_prediction_inconsistent(
     state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
 ) -> bool:
     verdict = judge_prediction(VelocityObservation(state, tick, age_s, parameters))
-    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.BRAKE, Cause.PREDICTION)
+    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.BRAKE, EventCode.PREDICTION_INCONSISTENT)
     return not verdict.is_none
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
 from uavctl.flight.kalman import (
     Belief,
     Kalman,
@@ -29,9 +30,6 @@ from uavctl.flight.kalman import (
     update_with_position,
 )
 from uavctl.records import Estimate, InertialSample, PositionSample, Vec3
-
-DUPLICATE = "sample-duplicate"
-TOO_OLD = "sample-too-old"
 
 # Largest time of a stamp after the arrival. Clocks over a link are known to milliseconds, and a stamp further off says
 # nothing of the capture. It is a constant, as a tick may be of any length.
@@ -157,9 +155,9 @@ def insert_sample(
     """
     key = (read_capture_ns(sample), _SAMPLE, sample.source, sample.captured_ns)
     if key[0] <= history.horizon_ns:
-        return history, TOO_OLD
+        return history, EventCode.SAMPLE_TOO_OLD
     if _is_duplicate(history.entries, key):
-        return history, DUPLICATE
+        return history, EventCode.SAMPLE_DUPLICATE
     new = FilterEvent(key=key, sample=sample, input=None, after=history.anchor)
     return _insert(kalman, history, new, belief), None
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import msgspec
 import numpy as np
 
-from uavctl.event_codes import MISSION
+from uavctl.event_codes import MISSION, EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.decide import Decided
 from uavctl.flight.fallback import Fallback, FallbackEnd
@@ -21,40 +21,37 @@ from uavctl.flight.link_estimate import LinkBelief, count_step, estimate_link
 from uavctl.flight.measure import Measured
 from uavctl.flight.monitors.acceleration import describe_push
 from uavctl.flight.monitors.engaged import MonitorState
-from uavctl.flight.monitors.external import CONTROLLER_FAULT
-from uavctl.flight.monitors.stale import REPEATED
-from uavctl.flight.monitors.verdict import Cause
 from uavctl.flight.orders import Ordered
 from uavctl.flight.state import AlarmGroup, ControlState
 from uavctl.flight.supervise import Supervised
 from uavctl.records import ControlMode, Event, LinkEstimate, Severity, Vec3, tell_all
 
-BIAS_AT_BOUND, BIAS_FREE = "bias-at-bound", "bias-free"
-STRONG_PUSH = "strong-push"  # a wind or a hit, not a false position: inertial data explain what positions show
 FREE = 0.9  # share of its bound below which a bias no longer is at it: one that settles there is reported once
-INERTIAL_DOUBTED, INERTIAL_SILENT, INERTIAL_USED = Cause.INERTIAL.value, "inertial-silent", "inertial-used"
 SILENT_NS = 1_000_000_000  # without inertial data
 ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for and begin
 
-_LINK_TEXTS = {
-    "link-bursts": "positions are lost in bursts: silence is longer than independent losses would make it",
-    "link-below-promise": "fewer positions arrive in time than the design counts on; limits may be broken more often",
+_LINK_TEXTS: dict[str, str] = {
+    EventCode.LINK_BURSTS: "positions are lost in bursts: silence is longer than independent losses would make it",
+    EventCode.LINK_BELOW_DESIGN: "fewer positions arrive in time than the design counts on; limits may be broken more often",
 }
-_INERTIAL_TEXTS = {
-    INERTIAL_DOUBTED: (
+_INERTIAL_TEXTS: dict[str, tuple[Severity, str]] = {
+    EventCode.INERTIAL_DOUBTED: (
         Severity.WARNING,
         "the vehicle's inertial data contradict its positions, its own velocity or its model: they are not used",
     ),
-    INERTIAL_SILENT: (Severity.WARNING, "no inertial data of the vehicle that are of now: flown by its model alone"),
-    INERTIAL_USED: (Severity.INFO, "the vehicle's inertial data are used"),
+    EventCode.INERTIAL_SILENT: (
+        Severity.WARNING,
+        "no inertial data of the vehicle that are of now: flown by its model alone",
+    ),
+    EventCode.INERTIAL_USED: (Severity.INFO, "the vehicle's inertial data are used"),
 }
 _ENTERED = {
-    ControlMode.WAIT: (Severity.WARNING, "disengaged"),
-    ControlMode.TRACK: (Severity.INFO, "track"),
-    ControlMode.BRAKE: (Severity.ERROR, "fallback-brake"),
-    ControlMode.HOLD: (Severity.WARNING, "fallback-hold"),
-    ControlMode.LAND: (Severity.ERROR, "fallback-land"),
-    ControlMode.STOPPED: (Severity.INFO, "stopped"),
+    ControlMode.WAIT: (Severity.WARNING, EventCode.DISENGAGED),
+    ControlMode.TRACK: (Severity.INFO, EventCode.TRACK),
+    ControlMode.BRAKE: (Severity.ERROR, EventCode.BRAKE),
+    ControlMode.HOLD: (Severity.WARNING, EventCode.HOLD),
+    ControlMode.LAND: (Severity.ERROR, EventCode.LAND),
+    ControlMode.STOPPED: (Severity.INFO, EventCode.STOPPED),
 }
 
 
@@ -109,32 +106,32 @@ def _report_faults(
     at_ns, released = context.at_ns, supervised.released
     if measured.restarted:
         text = "positions jumped while nobody flew on them; the estimate begins anew"
-        yield _make_event(at_ns, Severity.WARNING, "position-restart", text)
+        yield _make_event(at_ns, Severity.WARNING, EventCode.POSITION_RESTART, text)
     if released is not None and released.cause is not None:
         yield _make_event(at_ns, Severity.ERROR, released.cause.value, released.text)
     if decided.fault and not state.monitors.external.fault:
-        yield _make_event(at_ns, Severity.ERROR, CONTROLLER_FAULT, decided.fault)
+        yield _make_event(at_ns, Severity.ERROR, EventCode.CONTROLLER_FAULT, decided.fault)
 
 
 def _report_samples(context: TickContext, measured: Measured) -> Iterable[Event]:
     """Report samples that were refused, and ticks that were missed."""
     at_ns, refused = context.at_ns, [why for _, why in measured.samples.refused]
-    for code in sorted(set(refused) - {REPEATED}):  # some sources send each value twice
+    for code in sorted(set(refused) - {EventCode.SAMPLE_REPEATED}):  # some sources send each value twice
         text = "the sample counts as lost"
         yield _make_event(at_ns, Severity.WARNING, code, text, refused.count(code))
     if context.inputs.missed_ticks:
         text = "ticks were missed; they are not made up for"
-        yield _make_event(at_ns, Severity.WARNING, "missed-ticks", text, context.inputs.missed_ticks)
+        yield _make_event(at_ns, Severity.WARNING, EventCode.MISSED_TICKS, text, context.inputs.missed_ticks)
 
 
 def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -> Iterable[Event]:
     """Report trouble of the solver, limits that gave way, a change of mode, and the end of the mission."""
     at_ns, plan, mode = context.at_ns, decided.new_plan, decided.mode
     if decided.solve is not None and decided.trouble:
-        yield _make_event(at_ns, Severity.WARNING, f"solve-{decided.solve.value}", decided.trouble)
+        yield _make_event(at_ns, Severity.WARNING, EventCode(f"solve-{decided.solve.value}"), decided.trouble)
     if plan is not None and plan.gave_way:
         text = tell_all(context.controller.names, plan.gave_way)
-        yield _make_event(at_ns, Severity.WARNING, "gave-way", text)
+        yield _make_event(at_ns, Severity.WARNING, EventCode.RELAXED, text)
     is_mission_over = _lands(decided.fallback) and not _lands(ordered.fallback)
     if mode is not context.mode or is_mission_over:
         severity, code = _ENTERED[mode]
@@ -162,8 +159,8 @@ def _count_link(
 def _find_link_alarms(link: LinkEstimate, reported: tuple[str, ...]) -> tuple[str, ...]:
     """Find the link alarms that hold; a reported one holds on until the estimate is on the good side again."""
     holds = {
-        "link-bursts": (link.bursts, link.burst_statistic > 0.0),
-        "link-below-promise": (link.below_promise, link.arrival_mean < link.promised),
+        EventCode.LINK_BURSTS: (link.bursts, link.burst_statistic > 0.0),
+        EventCode.LINK_BELOW_DESIGN: (link.below_promise, link.arrival_mean < link.promised),
     }
     return tuple(code for code, (on, still) in holds.items() if on or (still and code in reported))
 
@@ -183,14 +180,14 @@ def _find_inertial_use(context: TickContext, supervised: Supervised) -> str:
     if not context.controller.kalman.n_inertial or belief is None or not we_fly:
         return ""
     if belief.inertial.distrusted_ns is not None:
-        return INERTIAL_DOUBTED
+        return EventCode.INERTIAL_DOUBTED
     newest_ns = belief.inertial.used_ns or history.origin_ns + ASKED_NS
-    return INERTIAL_SILENT if context.at_ns - newest_ns > SILENT_NS else INERTIAL_USED
+    return EventCode.INERTIAL_SILENT if context.at_ns - newest_ns > SILENT_NS else EventCode.INERTIAL_USED
 
 
 def _report_inertial(before: str, now: str, at_ns: int) -> Iterable[Event]:
     """Report a change in the use of inertial data; their use only where they were not used before."""
-    if now not in ("", before) and (now != INERTIAL_USED or before):
+    if now not in ("", before) and (now != EventCode.INERTIAL_USED or before):
         severity, text = _INERTIAL_TEXTS[now]
         yield _make_event(at_ns, severity, now, text)
 
@@ -229,10 +226,10 @@ def report_bias(push_mps2: Vec3, before: Sequence[int], now: Sequence[int], at_n
             f"a lasting push, as wind, is as large as what may be flown against it ({pushes} m/s² north, east, down): "
             "what it is more carries the vehicle off its target"
         )
-        return (_make_event(at_ns, Severity.WARNING, BIAS_AT_BOUND, text),)
+        return (_make_event(at_ns, Severity.WARNING, EventCode.BIAS_AT_BOUND, text),)
     if before and not now:
         text = "the lasting push is again within what may be flown against it"
-        return (_make_event(at_ns, Severity.INFO, BIAS_FREE, text),)
+        return (_make_event(at_ns, Severity.INFO, EventCode.BIAS_FREE, text),)
     return ()
 
 
@@ -241,4 +238,4 @@ def _report_push(before: MonitorState, now: MonitorState, context: TickContext) 
     if before.acceleration.is_pushed or not now.acceleration.is_pushed:
         return ()
     text = describe_push(now.motion, context.inputs.motion, context.at_ns)
-    return (_make_event(context.at_ns, Severity.WARNING, STRONG_PUSH, text),)
+    return (_make_event(context.at_ns, Severity.WARNING, EventCode.STRONG_PUSH, text),)

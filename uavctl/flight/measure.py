@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.estimator import (
     LATEST_STAMP_NS,
@@ -39,12 +40,9 @@ from uavctl.flight.monitors import outliers, stale
 from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierObservation, OutlierTrack, Reach
 from uavctl.flight.monitors.stale import MovedNs, StaleObservation
-from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Cause, Verdict
+from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.flight.state import ControlState, InertialReading, SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleStatus
-
-INVALID = "sample-invalid"
-FUTURE = "sample-future"
 
 # A plan bridges H steps; a sample that used up no more than this part of them on its way leaves most of them to it.
 _FRESH_PART = 3
@@ -206,7 +204,11 @@ def _track_absurd(
     """Track positions further out than any can be, since one was accepted."""
     if any_accepted:
         return None
-    far = [read_capture_ns(sample) for sample, reason in refused if reason == INVALID and _is_far_out(sample, kalman)]
+    far = [
+        read_capture_ns(sample)
+        for sample, reason in refused
+        if reason == EventCode.SAMPLE_INVALID and _is_far_out(sample, kalman)
+    ]
     if not far:
         return absurd
     first_ns, count = (far[0], 0) if absurd is None else (absurd.first_ns, absurd.count)
@@ -271,7 +273,9 @@ def _judge_sample(
         return replace(sources, outliers=track), NO_VERDICT
     record = records[sample.source]
     if record.at_ns == at_ns and record.repeats:
-        return sources, Verdict(Action.DISTRUST_POSITIONS, Cause.FROZEN)  # a value that came before did not jump
+        return sources, Verdict(
+            Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN
+        )  # a value that came before did not jump
     return replace(sources, outliers=track), verdict
 
 
@@ -305,14 +309,14 @@ def find_refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParame
         parameters: Largest plausible position and velocity.
     """
     if not _is_plausible(sample.position_m, parameters.max_position_m):
-        return INVALID
+        return EventCode.SAMPLE_INVALID
     if sample.velocity_mps is not None and not _is_plausible(sample.velocity_mps, parameters.max_velocity_mps):
-        return INVALID
+        return EventCode.SAMPLE_INVALID
     # A standard deviation beyond the largest position says nothing, and its square may overflow.
     if not 0.0 < sample.std_m <= parameters.max_position_m:
-        return INVALID
+        return EventCode.SAMPLE_INVALID
     if sample.received_ns > at_ns or sample.captured_ns > sample.received_ns + LATEST_STAMP_NS:
-        return FUTURE
+        return EventCode.SAMPLE_FUTURE
     return None
 
 

@@ -29,6 +29,7 @@ from __future__ import annotations
 import msgspec
 from msgspec.structs import replace
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.context import FilterView, TickContext, observe_motion, read_position, read_velocity, view_filter
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import (
@@ -49,26 +50,27 @@ from uavctl.flight.monitors.external import AnswerObservation, ExternalState, Wa
 from uavctl.flight.monitors.inertial import InertialObservation, Source
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
-from uavctl.flight.monitors.verdict import NO_VERDICT, Cause, Verdict, brake, release
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, release
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
 from uavctl.records import ControlMode, Estimate, Order
 
 # Causes after which no position is believed any more.
-OF_POSITIONS = frozenset({Cause.RESPONSE, Cause.VELOCITY, Cause.SCATTER})
-RELEASES = OF_POSITIONS.union({Cause.OUTSIDE, Cause.BRAKING})
+OF_POSITIONS = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
+RELEASES = OF_POSITIONS.union({EventCode.OUTSIDE, EventCode.BRAKING})
 
 PLAYED_OUT_STEPS = 2  # without a position: from there on a prediction is compared with the vehicle's own velocity
 REPLAN_STEPS = 3  # for which a plan is made anew once positions were dropped: the setpoint is slew-limited
 
-_ABSURD = release(Cause.OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
-_JUMPED = brake(Cause.JUMP, "positions jumped: braking until they are believed again, or not any more")
+_ABSURD = release(EventCode.OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
+_JUMPED = brake(EventCode.SAMPLE_JUMP, "positions jumped: braking until they are believed again, or not any more")
 _ABSURD_SO_FAR = brake(
-    Cause.ABSURD, "positions are further out than any can be: braking until they are believed again, or not any more"
+    EventCode.POSITIONS_ABSURD,
+    "positions are further out than any can be: braking until they are believed again, or not any more",
 )
 _ENDS = {
-    Cause.CONTROLLER_LATE: FallbackEnd.CONTROLLER_FAILED,
-    Cause.SOURCE_MOVED: FallbackEnd.POSITIONS_DISTRUSTED,
-    Cause.ABSURD: FallbackEnd.POSITIONS_DISTRUSTED,
+    EventCode.CONTROLLER_LATE: FallbackEnd.CONTROLLER_FAILED,
+    EventCode.SOURCE_MOVED: FallbackEnd.POSITIONS_DISTRUSTED,
+    EventCode.POSITIONS_ABSURD: FallbackEnd.POSITIONS_DISTRUSTED,
     **dict.fromkeys(RELEASES, FallbackEnd.RELEASED),
 }
 
@@ -255,7 +257,7 @@ def _judge_sources(measured: Measured, context: TickContext) -> Verdict:
     samples = measured.samples
     if not context.is_flown or not (samples.source_moved or samples.all_absurd):
         return NO_VERDICT
-    return release(Cause.SOURCE_MOVED if samples.source_moved else Cause.ABSURD, "")
+    return release(EventCode.SOURCE_MOVED if samples.source_moved else EventCode.POSITIONS_ABSURD, "")
 
 
 def _judge_plan(
@@ -363,7 +365,7 @@ def _update_unengaged(state: ControlState, measured: Measured, context: TickCont
     observation = observe_motion(None, context, accel_mps2, measured.samples.accepted)
     monitors, verdict = engaged.update(monitors, observation, bounds)
     # Once positions were wrong the vehicle's own velocity may be, too: its estimate is made of them.
-    counts = not before.position_inconsistent if verdict.cause is Cause.VELOCITY else reading is not None
+    counts = not before.position_inconsistent if verdict.cause is EventCode.VELOCITY else reading is not None
     return monitors, verdict if counts else NO_VERDICT
 
 

@@ -28,7 +28,7 @@ from logs.report.vehicle_texts import classify_text
 from logs.report.verdicts import judge_flight
 from uavctl.account import make_ending
 from uavctl.cause import CAUSES, GOOD, Cause
-from uavctl.flight.monitors import verdict as monitor
+from uavctl.event_codes import EventCode
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.records import ControlMode, Event, LinkStats, RelayStats, Severity, VehicleStatus
 
@@ -348,7 +348,7 @@ def test_a_relay_that_is_held_back_as_the_vehicle_was_let_go_is_no_cause(
     row = RelayStats(at_ns=good.origin_ns + 6 * SECOND, sent=100, kept={}, last_ns=good.origin_ns + 5 * SECOND,
                      alone=False, silent_for=reason)  # fmt: skip
     if lets_go:
-        flight = add_event(flight, 5.0, monitor.Cause.OUTSIDE, "the estimate leaves a limit", Severity.ERROR)
+        flight = add_event(flight, 5.0, EventCode.OUTSIDE, "the estimate leaves a limit", Severity.ERROR)
     headline = head(dataclasses.replace(flight, relays=(row,)))
     assert (Cause.RELAY_SILENT in headline.causes) != (lets_go and reason == "held back")
 

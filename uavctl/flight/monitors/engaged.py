@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.monitors import acceleration, braking, outside, velocity
 from uavctl.flight.monitors.acceleration import AccelerationState
 from uavctl.flight.monitors.braking import BrakingState
@@ -20,7 +21,7 @@ from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, 
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.outside import OutsideState
 from uavctl.flight.monitors.velocity import VelocityState
-from uavctl.flight.monitors.verdict import NO_VERDICT, Cause, Verdict
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict
 from uavctl.records import PositionSample, Vec3
 
 # Time of a flight after which positions of another body or frame would have been found.
@@ -88,7 +89,7 @@ def _update_with_position(
         velocity=velocity_state,
         clean_ns=position.at_ns if position.begins or is_clean else state.clean_ns,
     )
-    if response.cause is Cause.SCATTER:  # both others say more of what is wrong
+    if response.cause is EventCode.SCATTER:  # both others say more of what is wrong
         return state, _select_first(contradiction, response)
     return state, _select_first(response, contradiction)
 

@@ -19,7 +19,8 @@ from enum import Enum, auto
 import msgspec
 from msgspec.structs import replace
 
-from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Cause, Verdict
+from uavctl.event_codes import EventCode
+from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 
 # Twenty readings come in a second, so one that is left out for nothing costs next to nothing.
 PLAUSIBLE_SIGMA = 3.0  # standard deviations in each axis
@@ -84,7 +85,7 @@ def _update_distrusted(trust: InertialTrust, since_ns: int, observation: Inertia
 
 
 def _distrust(trust: InertialTrust, at_ns: int) -> tuple[InertialTrust, Verdict]:
-    verdict = Verdict(Action.DISTRUST_INERTIAL, Cause.INERTIAL, since_ns=at_ns)
+    verdict = Verdict(Action.DISTRUST_INERTIAL, EventCode.INERTIAL_DOUBTED, since_ns=at_ns)
     return replace(trust, distrusted_ns=at_ns), verdict
 
 

@@ -19,12 +19,11 @@ import msgspec
 import numpy as np
 
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
 from uavctl.flight.kalman import Belief, Kalman
 from uavctl.flight.limits import LimitsParameters
-from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Cause, Verdict
+from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.smpc.plant import AXES, Plant
-
-JUMP = Cause.JUMP.value
 
 _SAMPLES = 3  # samples that agree make a jump; two may be a chance,
 _SUSPECT_SAMPLES, _SUSPECT_NS = 2, 100_000_000  # but so long apart they are reason enough to brake
@@ -131,7 +130,7 @@ def _reach_since(reach: Reach, belief: Belief) -> Array:
     return reach.far[ticks] if ticks < len(reach.far) else np.full(reach.far.shape[1], np.inf)
 
 
-_DISTRUSTED = Verdict(Action.DISTRUST_POSITIONS, Cause.JUMP)
+_DISTRUSTED = Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_JUMP)
 
 
 def update(track: OutlierTrack | None, observation: OutlierObservation) -> tuple[OutlierTrack | None, Verdict]:

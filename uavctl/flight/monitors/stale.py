@@ -27,14 +27,12 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import FilterHistory, predict_belief, predict_without_samples
 from uavctl.flight.kalman import Belief, Kalman, read_capture_ns, read_measurement
 from uavctl.flight.monitors.outliers import GateParameters
-from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Cause, Verdict
+from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.records import PositionSample, Vec3
-
-FROZEN = Cause.FROZEN.value
-REPEATED = Cause.REPEATED.value
 
 _REPEATS = 3  # repeats that are no chance: some sources send each value twice
 _MANY_RESOLUTIONS = 20.0  # resolutions: noise or a spread of so much must have moved the value
@@ -151,13 +149,13 @@ def update(records: SourceRecords, observation: StaleObservation) -> tuple[Sourc
     if is_stuck(record, kalman, sample, observation.parameters, moved_ns):
         since_ns = record.find_still_since_ns(moved_ns) or record.stale_since_ns
         records = {**records, sample.source: replace(record, is_known_stuck=True)}
-        return records, Verdict(Action.DISTRUST_POSITIONS, Cause.FROZEN, since_ns=since_ns)
+        return records, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN, since_ns=since_ns)
     if not is_doubtful(record, kalman, sample, observation.parameters):
         return records, NO_VERDICT
     if not record.is_unusual:
-        return records, Verdict(Action.DISTRUST_POSITIONS, Cause.REPEATED)
+        return records, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_REPEATED)
     records = {**records, sample.source: replace(record, is_doubted=True)}
-    return records, Verdict(Action.DISTRUST_POSITIONS, Cause.REPEATED, since_ns=record.stale_since_ns)
+    return records, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_REPEATED, since_ns=record.stale_since_ns)
 
 
 def record_sample(

@@ -18,15 +18,16 @@ from collections.abc import Sequence
 
 import msgspec
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.engaged import MonitorState
 from uavctl.flight.monitors.motion import bound_gusts_mps
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, read_vehicle_velocity
-from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Cause, Verdict, brake
+from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict, brake
 from uavctl.records import Vec3, VehicleMotion
 
 MISLEADS = 4.0  # disagreements between a prediction and the vehicle that gusts alone do not make
 MODEL_COUNTS_S = 10.0  # of a flight: for so long the setpoints say something of the velocity
-_DISTRUSTED = Verdict(Action.DISTRUST_VEHICLE_VELOCITY, Cause.VELOCITY)
+_DISTRUSTED = Verdict(Action.DISTRUST_VEHICLE_VELOCITY, EventCode.VELOCITY)
 
 
 class VelocityObservation(msgspec.Struct, frozen=True, eq=False):
@@ -71,7 +72,9 @@ def judge_prediction(observation: VelocityObservation) -> Verdict:
     within_mps = MISLEADS * parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
     if velocity is None or _is_near(velocity, observation.tick.velocity_mps, within_mps):
         return NO_VERDICT
-    return brake(Cause.PREDICTION, "the vehicle moves otherwise than was predicted, and no position says why")
+    return brake(
+        EventCode.PREDICTION_INCONSISTENT, "the vehicle moves otherwise than was predicted, and no position says why"
+    )
 
 
 def is_inertial_consistent(observation: VelocityObservation) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from enum import Enum, StrEnum, auto
+from enum import Enum, auto
 
 import msgspec
+
+from uavctl.event_codes import EventCode
 
 
 class Action(Enum):
@@ -18,30 +20,11 @@ class Action(Enum):
     RELEASE = auto()  # never fly a plan again in this flight
 
 
-class Cause(StrEnum):
-    """Cause of a verdict; where an event reports it, the event's code."""
-
-    OUTSIDE = "envelope-outside"  # the estimate is outside the room
-    RESPONSE = "envelope-response"  # positions show an acceleration that nothing explains
-    VELOCITY = "envelope-velocity"  # positions move otherwise than the vehicle says
-    SCATTER = "envelope-scatter"  # positions scatter more than the vehicle can move
-    BRAKING = "envelope-braking"  # braking has no effect
-    FROZEN = "sample-frozen"  # a source repeats its value although the vehicle moves
-    REPEATED = "sample-repeated"  # a source repeats its value, and it may be stuck
-    JUMP = "sample-jump"  # a position that the vehicle cannot have come to
-    SOURCE_MOVED = "positions-moved"  # such positions agree for so long that their source has moved
-    ABSURD = "positions-absurd"  # all positions are further out than any can be
-    PREDICTION = "prediction-inconsistent"  # the vehicle moves otherwise than was predicted
-    INERTIAL = "inertial-doubted"  # inertial data contradict positions, the vehicle's velocity or the model
-    CONTROLLER_LATE = "controller-late"  # a controller of another package takes too long
-    CONTROLLER_WALL = "controller-wall"  # it flies too fast towards a limit
-
-
 class Verdict(msgspec.Struct, frozen=True):
     """Verdict of a monitor."""
 
     action: Action = Action.NONE
-    cause: Cause | None = None  # None without an action
+    cause: EventCode | None = None  # None without an action
     text: str = ""  # cause in words
     since_ns: int | None = None  # time from which on data are distrusted [ns]; None where nothing is
 
@@ -54,11 +37,11 @@ class Verdict(msgspec.Struct, frozen=True):
 NO_VERDICT = Verdict()
 
 
-def release(cause: Cause, text: str) -> Verdict:
+def release(cause: EventCode, text: str) -> Verdict:
     """Make the verdict that ends a flight on plans."""
     return Verdict(Action.RELEASE, cause, text)
 
 
-def brake(cause: Cause, text: str) -> Verdict:
+def brake(cause: EventCode, text: str) -> Verdict:
     """Make the verdict that brakes a flight on a plan."""
     return Verdict(Action.BRAKE, cause, text)
