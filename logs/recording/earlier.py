@@ -45,7 +45,9 @@ def complete_record(record: Record) -> Record:
     if isinstance(record, Ending) and not record.code:
         return replace(record, code=find_ending_code(record.cause))
     if isinstance(record, RecorderNote) and record.kind is NoteKind.STATE:
-        kind = next((kind for text, kind in _KINDS.items() if record.text.startswith(text)), NoteKind.STATE)
+        kind = next((kind for text, kind in _KINDS.items() if record.text.startswith(text)), None)
+        if kind is None:
+            return record
         return replace(
             record,
             kind=kind,

@@ -12,7 +12,7 @@ from report_rig import collect_figures, data, read_page_text
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
-from logs.recording.notes import RecorderNote
+from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.summary import summarise
 from logs.report import link_figures, plan_figures, plots
 from logs.report.figures import draw_overview
@@ -148,24 +148,24 @@ def test_a_part_of_a_flight_says_so(flight: FlightData) -> None:
     assert any(line.startswith("40 steps;") for line in seen) and "controller took over" not in text
 
 
-def note(text: str, segment: int = 1) -> RecorderNote:
-    return RecorderNote(at_ns=0, segment=segment, written=0, dropped=0, refused=0, failures=0, text=text)
+def note(text: str, segment: int = 1, kind: NoteKind = NoteKind.STATE) -> RecorderNote:
+    return RecorderNote(at_ns=0, segment=segment, written=0, dropped=0, refused=0, failures=0, text=text, kind=kind)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("last", "told", "breaks_off"),
+    ("last", "kind", "told", "breaks_off"),
     [
-        ("end", "", False),
-        ("begin", "not closed in order", True),
-        ("goes on in the next file", "in the next file", False),
-        ("recovered from torn.mcap: 0 messages and 5 bytes lost", "recovered from torn.mcap", True),
+        ("end", NoteKind.END, "", False),
+        ("begin", NoteKind.BEGIN, "not closed in order", True),
+        ("goes on in the next file", NoteKind.CONTINUED, "in the next file", False),
+        ("recovered from torn.mcap: 5 bytes lost", NoteKind.RECOVERED, "recovered from torn.mcap", True),
     ],
 )
 def test_a_recording_that_is_not_all_of_the_flight_says_so(
-    flight: FlightData, last: str, told: str, breaks_off: bool
+    flight: FlightData, last: str, kind: NoteKind, told: str, breaks_off: bool
 ) -> None:
-    cut = dataclasses.replace(flight, notes=(note("begin"), note(last)))
+    cut = dataclasses.replace(flight, notes=(note("begin", kind=NoteKind.BEGIN), note(last, kind=kind)))
     text = " ".join(read_page_text(cut).text)
     assert told in text
     assert ("The recording breaks off." in text) is breaks_off
