@@ -32,7 +32,9 @@ ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for 
 
 _LINK_TEXTS: dict[str, str] = {
     EventCode.LINK_BURSTS: "positions are lost in bursts: silence is longer than independent losses would make it",
-    EventCode.LINK_BELOW_DESIGN: "fewer positions arrive in time than the design counts on; limits may be broken more often",
+    EventCode.LINK_BELOW_DESIGN: (
+        "fewer positions arrive in time than the design counts on; limits may be broken more often"
+    ),
 }
 _INERTIAL_TEXTS: dict[str, tuple[Severity, str]] = {
     EventCode.INERTIAL_DOUBTED: (
