@@ -1,187 +1,143 @@
-"""Tests of the tests of the safety core: every branch of it is run, and each small change of it fails a test.
+"""Mutation testing of the safety core: each small change of a module must fail one of the module's own tests.
 
-The changes are those of cosmic-ray, and lines of tables that are left out or are like the next. cosmic-ray would run
-each in an interpreter of its own, which takes seconds for imports alone; here a fork that has imported everything but
-this project runs the tests of the module against each change. A change that all of them pass survives: its line in
-docs/safety-core.md says why it may. One without a line there, and a line there that nothing survives as, fail the run.
-Nothing is written to the tree.
+1. `mutants.find_mutants` lists the changes of a module.
+2. `find_survivors` runs the tests against each change in a fork that has imported all but this project. The first test
+   that fails ends the run: the change is killed. A change that all tests pass survives.
+3. docs/safety-core.md gives a reason for each survivor. A survivor without a reason fails the run, and so does a reason
+   without its survivor.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import difflib
 import gc
 import importlib.machinery
 import os
+import re
 import resource
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from itertools import chain
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
 from types import CodeType
 
-import msgspec  # noqa: F401  # these only so that the forks find them imported
+import hypothesis  # noqa: F401  # these only so that the forks find them imported
+import msgspec  # noqa: F401
 import numpy  # noqa: F401
 import pytest
-import scipy.integrate
-import scipy.linalg  # noqa: F401
-from cosmic_ray.mutating import mutate_code
-from cosmic_ray.plugins import get_operator, operator_names
-from safety_core import ROOT, TARGETS, what_is_not_run
+import scipy.linalg
+import scipy.spatial.transform  # noqa: F401
+from mutants import Mutant, Row, find_mutants
+from safety_core import ROOT, TARGETS
 
 PAGE = ROOT / "docs" / "safety-core.md"
-CPU_S = 10  # of one change's tests, which take about one: a change may make a loop endless
+CPU_S = 60  # of one mutant's tests, which take a few: a change may make a loop endless
 
 
-@dataclass(frozen=True)
-class Mutant:
-    """One change of a module: the text of the change, as the docs name it, and the module's source with it."""
+class KillersFirst:
+    """Plugin of pytest: runs the tests that failed last first, and writes the name of one that fails."""
 
-    module: str
-    change: str
-    source: str
+    def __init__(self, killers: Sequence[str], output: int) -> None:
+        self._rank = {name: rank for rank, name in enumerate(killers)}
+        self._output = output
 
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Sort the tests."""
+        items.sort(key=lambda item: -self._rank.get(item.nodeid, -1))
 
-def mutants(module: str) -> Iterator[Mutant]:
-    """All changes of a module that do something: annotations are never evaluated."""
-    source = _source(module)
-    seen = {meaning(source)}
-    for changed in chain(operators(source), tables(source)):
-        sense = meaning(changed)
-        if sense and sense not in seen:
-            seen.add(sense)
-            yield Mutant(module, told(source, changed), changed)
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Write the name."""
+        if report.failed:
+            os.write(self._output, report.nodeid.encode())
 
 
-def operators(source: str) -> Iterator[str]:
-    """A source with each change of cosmic-ray."""
-    for name in sorted(operator_names()):
-        kind = get_operator(name)
-        if kind.arguments():
-            continue
-        for occurrence in range(sys.maxsize):
-            changed = mutate_code(source, kind(), occurrence)
-            if changed is None:
-                break
-            yield changed
+def find_survivors(path: Path, mutants: Sequence[Mutant], tests: Sequence[Path], jobs: int) -> list[Mutant]:
+    """Run the tests against each mutant of the module at a path; return those that all tests pass."""
+    gc.freeze()  # the forks need not look through what is here already
+    waiting, running = [*mutants][::-1], dict[int, tuple[Mutant, int]]()
+    survivors: list[Mutant] = []
+    killers: list[str] = []
+    while waiting or running:
+        while waiting and len(running) < jobs:
+            mutant = waiting.pop()
+            read_end, write_end = os.pipe()
+            child = os.fork()
+            if child == 0:
+                os._exit(_run_tests(path, mutant.source, tests, KillersFirst(killers, write_end)))
+            os.close(write_end)
+            running[child] = mutant, read_end
+        child, status = os.wait()
+        mutant, read_end = running.pop(child)
+        killer = os.read(read_end, 4096).decode()  # empty if none has failed, or if the time was over
+        os.close(read_end)
+        killers = [*(name for name in killers if name != killer), killer]
+        if status == 0:
+            survivors.append(mutant)
+        if sys.stderr.isatty():
+            done = len(mutants) - len(waiting) - len(running)
+            sys.stderr.write(f"\r{path.stem}: {done} of {len(mutants)}, {len(survivors)} survive ")
+    return sorted(survivors, key=lambda one: one.line)
 
 
-def tables(source: str) -> Iterator[str]:
-    """A source without each line of its tables, and with the value of the next line in it; cosmic-ray has neither."""
-    lines = source.splitlines(keepends=True)
-    for table in ast.walk(ast.parse(source)):
-        if not isinstance(table, ast.Dict):
-            continue
-        values = [value for value in table.values if table.lineno < value.lineno == value.end_lineno]
-        for value, other in zip(values, [*values[1:], *values[:1]], strict=True):
-            at, line = value.lineno - 1, lines[value.lineno - 1]
-            put = line[: value.col_offset] + str(ast.get_source_segment(source, other)) + line[value.end_col_offset :]
-            yield from ("".join([*lines[:at], new, *lines[at + 1 :]]) for new in ("", put))
-
-
-def meaning(source: str) -> str:
-    """A source without its annotations, comments and layout; nothing if it is none (`**` to `+` in `{**a}`)."""
-    try:
-        tree = ast.parse(source)
-    except SyntaxError:
-        return ""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.AnnAssign):
-            node.annotation = ast.Constant(None)
-        elif isinstance(node, ast.arg):
-            node.annotation = None
-        elif isinstance(node, ast.FunctionDef):
-            node.returns = None
-    return ast.dump(tree)
-
-
-def told(source: str, changed: str) -> str:
-    """A change as `line -> line`, with the number of lines of that text before it where the text is there twice."""
-    old, new = source.splitlines(), changed.splitlines()
-    blocks = difflib.SequenceMatcher(None, old, new, autojunk=False).get_opcodes()
-    first = next((tag, a, b, c, d) for tag, a, b, c, d in blocks if tag != "equal")
-    _, a, b, c, d = first
-    before = " ".join(line.strip() for line in old[a:b])
-    again = [line.strip() for line in old[:a]].count(before)
-    after = " ".join(line.strip() for line in new[c:d]) or "left out"
-    return f"{before}{f' [{again + 1}]' if again else ''} -> {after}"
-
-
-def survives(mutant: Mutant) -> bool:
-    """Whether all tests of the module pass with the change."""
-    child = os.fork()
-    if child == 0:
-        os._exit(_passes(mutant))
-    _, status = os.waitpid(child, 0)
-    return status == 0
-
-
-def _passes(mutant: Mutant) -> int:
-    """In the child: 0 if the tests pass."""
+def _run_tests(path: Path, source: bytes, tests: Sequence[Path], plugin: KillersFirst) -> int:
+    """Run the tests, in a fork, with a module of this source; 0 if they pass."""
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
     quiet = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(quiet, stream)
-    sys.dont_write_bytecode = True
-    path = str(ROOT / mutant.module)
     read = importlib.machinery.SourceFileLoader.get_code
 
-    def get_code(loader: importlib.machinery.SourceFileLoader, fullname: str) -> CodeType | None:
-        if loader.path == path:
-            return compile(mutant.source, path, "exec", dont_inherit=True)
-        return read(loader, fullname)
+    def get_code(loader: importlib.machinery.SourceFileLoader, name: str) -> CodeType | None:
+        is_changed = Path(loader.path) == path
+        return compile(source, str(path), "exec", dont_inherit=True) if is_changed else read(loader, name)
 
     importlib.machinery.SourceFileLoader.get_code = get_code  # type: ignore[method-assign,assignment]
-    tests = [str(ROOT / test) for test in TARGETS[mutant.module]]
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take longer than the tests
-    options = ["-x", "-q", "-p", "no:cacheprovider", "--rootdir", str(ROOT)]
-    return int(pytest.main([*options, *tests]))
+    return int(pytest.main(["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *map(str, tests)], plugins=[plugin]))
 
 
-def justified(page: str) -> dict[tuple[str, str], str]:
-    """(module, change) -> why it may survive, from the page's tables `| module | change | reason |`."""
-    rows = [line.strip().strip("|").split(" | ") for line in page.splitlines() if line.startswith("| `uavctl/")]
-    return {
-        (row[0].strip(" `"), row[1].strip(" `")): row[2].strip() for row in rows if len(row) == 3 and row[2].strip()
-    }
+def read_reasons(page: str) -> set[Row]:
+    """Return the survivors that have a reason: rows `| module | before -> after | reason |` of a page."""
+    rows = re.findall(r"^\| `(\S+)` \| `(.+?) -> (.+)` \| [^|]+ \|$", page, flags=re.MULTILINE)
+    return {(str(module), str(before), str(after)) for module, before, after in rows}
+
+
+def check_module(module: str, reasons: set[Row], line: int | None, jobs: int) -> tuple[str, bool]:
+    """Test a module, or one of its lines; return its row of the table, and whether its survivors have reasons."""
+    path, tests = ROOT / module, [ROOT / test for test in TARGETS[module]]
+    source = path.read_bytes()
+    if not find_survivors(path, [Mutant(module, 0, "", "", source)], tests, 1):
+        raise SystemExit(f"{module}: its tests fail without a change")
+    mutants = [one for one in find_mutants(module, source) if line in (None, one.line)]
+    survivors = find_survivors(path, mutants, tests, jobs)
+    unexplained = [one for one in survivors if one.row not in reasons]
+    stale = {row for row in reasons if row[0] == module and line is None} - {one.row for one in survivors}
+    row = f"| `{module}` | {len(mutants)} | {len(mutants) - len(survivors)} | {len(survivors)} |"
+    sys.stdout.write(f"\r{row}\n")
+    for one in unexplained:
+        sys.stdout.write(f"{module}:{one.line}: survives without a reason\n  - {one.before}\n  + {one.after}\n")
+    for _, before, after in sorted(stale):
+        sys.stdout.write(f"{module}: does not survive, but has a reason\n  - {before}\n  + {after}\n")
+    sys.stdout.flush()
+    return row, not unexplained and not stale
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Check all modules, or those named; 0 if every branch of them is run and every survivor is justified."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("modules", nargs="*", choices=[[], *TARGETS], default=[])
-    modules = parser.parse_args(arguments).modules or list(TARGETS)
-    reasons = justified(PAGE.read_text(encoding="utf-8"))
-    wrong = 0
-    for module in modules:
-        begun = time.monotonic()
-        uncovered = what_is_not_run(module)
-        if uncovered or not survives(Mutant(module, "", _source(module))):
-            sys.stdout.write(f"{uncovered}FAILED  {module}: its tests do not pass as it is, or leave branches out\n")
-            return 1
-        changes = list(mutants(module))
-        gc.freeze()  # the forks need not look through what is here already
-        with ThreadPoolExecutor(os.cpu_count()) as pool:  # threads only wait; the work is in their forks
-            alive = [one for one, lives in zip(changes, pool.map(survives, changes), strict=True) if lives]
-        new = [one.change for one in alive if (module, one.change) not in reasons]
-        left = {change for name, change in reasons if name == module} - {one.change for one in alive}
-        for change in new:
-            sys.stdout.write(f"survives without a reason in {PAGE.name}: | `{module}` | `{change}` | |\n")
-        for change in sorted(left):
-            sys.stdout.write(f"does not survive, but {PAGE.name} has a reason: | `{module}` | `{change}` |\n")
-        wrong += len(new) + len(left)
-        seconds = time.monotonic() - begun
-        sys.stdout.write(f"{module}: {len(changes)} changes, {len(alive)} survive ({seconds:.0f} s)\n")
-        sys.stdout.flush()
-    return 1 if wrong else 0
-
-
-def _source(module: str) -> str:
-    return (ROOT / module).read_text(encoding="utf-8")
+    """Test all modules, or some; 0 if the survivors are those with a reason."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", metavar="MODULE", action="append", choices=TARGETS, help="may be given again")
+    parser.add_argument("--line", type=int, help="only the changes of this line")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="tests at a time")
+    options = parser.parse_args(arguments)
+    reasons = read_reasons(PAGE.read_text(encoding="utf-8"))
+    modules = options.only or TARGETS
+    with tempfile.TemporaryDirectory() as folder:
+        # Each run would compile what it imports anew. The changed module itself is never kept.
+        sys.pycache_prefix, sys.dont_write_bytecode = folder, False
+        rows, right = zip(*(check_module(one, reasons, options.line, options.jobs) for one in modules), strict=True)
+    sys.stdout.write("\n".join(["", "| module | mutants | killed | survivors |", "|---|---|---|---|", *rows, ""]))
+    return int(not all(right))
 
 
 if __name__ == "__main__":

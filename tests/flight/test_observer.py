@@ -19,7 +19,14 @@ from uavctl.flight.monitors.acceleration import AccelerationState, describe_acce
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation
-from uavctl.flight.monitors.observer import InertialSpan, Observer, extend_path, move_along
+from uavctl.flight.monitors.observer import (
+    InertialSpan,
+    Observer,
+    correct_observer,
+    extend_path,
+    move_along,
+    predict_observer,
+)
 from uavctl.records import Vec3, VehicleMotion
 
 BOUND_MPS2 = PARAMETERS.unexplained_mps2
@@ -277,6 +284,24 @@ def test_positions_come_back_after_a_silence_of_more_than_a_second(silent_ns: in
     at_ns = START_NS + silent_ns
     after, _ = update(monitors(observer=observer, tick_ns=START_NS), seen(at_ns, sample(at_ns, at_ns)), PARAMETERS)
     assert after.motion.resumed_ns == (at_ns if is_silence else None)
+
+
+def test_what_inertial_data_drive_begins_at_the_observer_and_leaves_nothing_unexplained() -> None:
+    mean = np.array([[1.0, 2.0, 3.0], [0.5, -0.5, 0.25], [9.0, 9.0, 9.0]])
+    observer = Observer(START_NS, mean, np.eye(3), np.zeros(3))
+    path = extend_path((), START_NS, (0.0, 0.0, 0.0), 0)
+    inertial = predict_observer(observer, (), path, START_NS + SECOND_NS, PARAMETERS.lag_s, 2.0).inertial
+    assert inertial is not None
+    np.testing.assert_allclose(inertial, [mean[0] + mean[1], mean[1], np.zeros(3)])
+
+
+@pytest.mark.parametrize(("off_m", "is_clipped"), [(0.0, False), (9.0, True)])
+def test_a_position_is_far_off_only_if_it_is_so_of_inertial_data_too(off_m: float, is_clipped: bool) -> None:
+    shown = np.zeros((3, 3))
+    shown[0, 0] = 9.0 - off_m
+    observer = Observer(START_NS, np.zeros((3, 3)), np.eye(3) * 1e-4, np.zeros(3), shown)
+    _, found = correct_observer(observer, np.array([9.0, 0.0, 0.0]), 0.02)
+    assert found == is_clipped
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,14 @@ def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_
     assert watched([0.0, 3.0])["camera"].resolution_m == 3.0
 
 
+def test_the_smallest_change_of_any_axis_shows_the_resolution() -> None:
+    history = begin_history(KALMAN, START_NS, START_NS)
+    records = record_sample({}, KALMAN, history, sample(START_NS), np.array([0.001]))
+    assert (records["camera"].still, records["camera"].gap_ns) == ((0, 0, 0), 0)
+    moved = sample(START_NS + TICK_NS, position_m=(0.5, 0.25, 0.0))
+    assert record_sample(records, KALMAN, history, moved, np.array([0.001]))["camera"].resolution_m == 0.25
+
+
 def test_coasting_goes_by_the_inputs_alone() -> None:
     two, three = watched([0.0, 0.5, 0.5])["camera"], watched([0.0, 0.5, 0.5, 0.5])["camera"]
     assert two.coasting is not None
