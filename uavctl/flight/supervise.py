@@ -1,6 +1,6 @@
 """Phase 2 of a tick: run the monitors, and turn their verdicts into actions.
 
-This is the only table from verdicts to actions:
+This is the only table from verdicts to actions; verdicts on single samples refuse them in `measure.py`:
 
     monitor               verdict                     positions           inertial data       flight
     engaged               release (`envelope-…`)      drop since clean    -                   RELEASED: level, land

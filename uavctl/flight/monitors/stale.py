@@ -35,7 +35,7 @@ from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.records import PositionSample, Vec3
 
 _REPEATS = 3  # repeats that are no chance: some sources send each value twice
-_MANY_RESOLUTIONS = 20.0  # resolutions: noise or a spread of so much must have moved the value
+_MANY_RESOLUTIONS = 20.0  # resolutions: noise, or the spread of a prediction, of so much must have moved the value
 _NOISY = 0.5  # of a resolution: rounding alone makes no more noise
 _PLAINLY_NOISY = 4.0  # resolutions: noise of that size does not give a value twice
 _LEAST_NOISE_M = 2e-5  # the numbers of a message make no more noise, however large the room is; any camera makes more

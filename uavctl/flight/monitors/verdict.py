@@ -1,4 +1,7 @@
-"""Verdict of a monitor: an action, a cause, and a time. `uavctl.flight.supervise` turns verdicts into actions."""
+"""Verdict of a monitor: an action, a cause, and a time. `uavctl.flight.supervise` turns verdicts into actions.
+
+Verdicts on single samples (a frozen value, an outlier) act in `uavctl.flight.measure`: such samples are refused.
+"""
 
 from __future__ import annotations
 
