@@ -38,7 +38,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "tests/flight/test_external_monitor.py",
     ),
     "uavctl/flight/monitors/outliers.py": ("tests/flight/test_reach_rules.py",),
-    "uavctl/flight/monitors/stale.py": ("tests/flight/test_stuck_rules.py", "tests/flight/test_samples.py"),
+    "uavctl/flight/monitors/frozen.py": ("tests/flight/test_stuck_rules.py", "tests/flight/test_samples.py"),
     "uavctl/mavlink/handover_states.py": ("tests/mavlink/test_mode.py",),
     "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py", "tests/mavlink/test_gate.py"),
 }

@@ -305,7 +305,7 @@ class FlightAccount:
         if self.control_error:
             return Cause.CONTROL_FAILED, self.control_error
         if self.release_reason:
-            return Cause.LET_GO, self.release_reason
+            return Cause.RELEASED, self.release_reason
         cause = self._cause
         if cause is None and self._state is HandoverState.ENGAGED and is_silent(self._now_ns, self._vehicle):
             return Cause.VEHICLE_SILENT, ""

@@ -208,7 +208,7 @@ class ControlLoop:
         return self._hand_over.failure
 
     @property
-    def let_go(self) -> str:
+    def release_reason(self) -> str:
         """Reason why a monitor has released the vehicle; empty while none has."""
         return "" if self._state.monitors.release is None else self._state.monitors.release.text
 
@@ -276,7 +276,7 @@ class ControlLoop:
         step_ns = self._stopwatch() - begin_ns
         self._decision = output.decision
         self._record_output(output, at_ns)
-        self.account.release_reason = self.let_go
+        self.account.release_reason = self.release_reason
         self.account.update_vehicle(at_ns, self._vehicle)
         self.account.add_decision(output.decision, output.events, has_estimate=output.estimate is not None)
         self._relay_positions(inputs, output, send, notices)
@@ -339,7 +339,9 @@ class ControlLoop:
         """Run the core for a tick. A core that has failed is not run again; the vehicle that it flew is to land."""
         if not self.account.control_error:
             try:
-                self._state, output = run_tick(self._state, inputs, self._controller, carried=self._hand_over.has_begun)
+                self._state, output = run_tick(
+                    self._state, inputs, self._controller, is_climbing_or_landing=self._hand_over.has_begun
+                )
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
                 notices.append(self._report_control_failure(error, inputs.at_ns))
                 return self._make_failed_output(

@@ -18,7 +18,7 @@ from logs.recording.flight import FLOWN, FlightData
 from uavctl.arrays import Array
 from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import Config
-from uavctl.flight.context import describe_unready
+from uavctl.flight.context import describe_not_ready
 from uavctl.flight.kalman import (
     Belief,
     Kalman,
@@ -85,7 +85,7 @@ class FilterReplay:
         self.kalman = kalman
         self.origin_ns = flight.origin_ns - flight.decisions[0].tick * flight.tick_ns
         self.samples = sorted({read_capture_ns(sample): sample for sample in flight.samples}.items())[:MAX_POSITIONS]
-        ready_by_tick = {step.tick: not describe_unready(step.vehicle) for step in flight.step_inputs}
+        ready_by_tick = {step.tick: not describe_not_ready(step.vehicle) for step in flight.step_inputs}
         self.input_ns: list[int] = []
         self.inputs: list[Array | None] = []
         for decision in flight.decisions:

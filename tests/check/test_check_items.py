@@ -105,7 +105,8 @@ def test_noise_beyond_the_filter_s_belief_fails() -> None:
 @pytest.mark.fault(14)
 def test_a_frozen_pose_is_told() -> None:
     found = run_check(["sim.camera.frozen=[[1.0,99.0]]"])
-    assert state(found, "position stuck") is ItemState.UNDETERMINED and "Move the body" in found["position stuck"].hint
+    assert state(found, "position frozen") is ItemState.UNDETERMINED
+    assert "Move the body" in found["position frozen"].hint
 
 
 @pytest.mark.fault(15)

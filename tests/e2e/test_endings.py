@@ -135,7 +135,7 @@ def test_the_pilot_takes_over(tmp_path: Path, run_flight: RunFlight, autopilot: 
     rig = EndingRig(tmp_path, f"sim.autopilot={autopilot}").add_step_in(
         HandoverState.ENGAGED, make_switch(mode), after_s=2.0
     )
-    rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=3.0)
+    rig.add_step_in(HandoverState.TAKEN_OVER, interrupt, after_s=3.0)
     report = run_flight(rig, Cause.PILOT, *TAKE_OFF, good=True)
     assert f"in the air, in mode {mode}" in report.ending["sentence"]
 
@@ -143,7 +143,7 @@ def test_the_pilot_takes_over(tmp_path: Path, run_flight: RunFlight, autopilot: 
 @pytest.mark.slow
 def test_the_pilot_takes_over_and_lands(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, make_switch("POSCTL"), after_s=2.0)
-    rig.add_step_in(HandoverState.RELEASED, make_switch("AUTO.LAND"), after_s=1.0)
+    rig.add_step_in(HandoverState.TAKEN_OVER, make_switch("AUTO.LAND"), after_s=1.0)
     run_flight(rig, Cause.PILOT_LANDED, good=True)
 
 
@@ -163,7 +163,7 @@ def test_a_failsafe_that_ended_in_the_climb_is_reported_with_the_later_end(
 @pytest.mark.slow
 def test_the_pilot_takes_over_in_the_climb(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path).add_step_in(HandoverState.CLIMBING, make_switch("POSCTL"), after_s=0.6)
-    rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=2.0)
+    rig.add_step_in(HandoverState.TAKEN_OVER, interrupt, after_s=2.0)
     report = run_flight(rig, Cause.PILOT, *TAKE_OFF)
     assert "before the controller" in report.ending["sentence"]
 
@@ -343,7 +343,7 @@ def test_it_disarms_in_flight(tmp_path: Path, run_flight: RunFlight) -> None:
 @pytest.mark.slow
 def test_the_envelope_lets_it_go(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "target.position_m=[2.0,1.0,-1.2]", peers=("frame.yaw_deg=90.0",))
-    report = run_flight(rig, Cause.LET_GO, *TAKE_OFF)
+    report = run_flight(rig, Cause.RELEASED, *TAKE_OFF)
     assert report.summary["let_go"] and report.summary["let_go"] in report.ending["sentence"]
 
 
@@ -364,7 +364,7 @@ def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path,
 @pytest.mark.slow
 def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, start_failsafe(Role.HOLD), after_s=2.0)
-    rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=2.0)
+    rig.add_step_in(HandoverState.TAKEN_OVER, interrupt, after_s=2.0)
     report = run_flight(rig, Cause.VEHICLE_FAILSAFE)
     assert "in the air" in report.ending["sentence"]
 
@@ -380,7 +380,7 @@ def test_the_vehicle_restarts(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = (
         EndingRig(tmp_path)
         .add_step_in(HandoverState.ENGAGED, young, after_s=2.0)
-        .add_step_in(HandoverState.RELEASED, interrupt, after_s=2.0)
+        .add_step_in(HandoverState.TAKEN_OVER, interrupt, after_s=2.0)
     )
     run_flight(rig, Cause.VEHICLE_RESTARTED, *TAKE_OFF)
 
@@ -435,11 +435,11 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
     rig.add_step_in(HandoverState.ENGAGED, EndingRig.request_status, after_s=1.0).add_step_in(
         HandoverState.ENGAGED, make_switch("POSCTL"), after_s=2.0
     )
-    rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=1.0).add_step_in(
-        HandoverState.RELEASED, EndingRig.request_status, after_s=3.0
+    rig.add_step_in(HandoverState.TAKEN_OVER, interrupt, after_s=1.0).add_step_in(
+        HandoverState.TAKEN_OVER, EndingRig.request_status, after_s=3.0
     )
-    rig.add_step_in(HandoverState.RELEASED, make_switch("AUTO.LAND"), after_s=5.0).add_step_in(
-        HandoverState.RELEASED, EndingRig.request_status, after_s=6.0
+    rig.add_step_in(HandoverState.TAKEN_OVER, make_switch("AUTO.LAND"), after_s=5.0).add_step_in(
+        HandoverState.TAKEN_OVER, EndingRig.request_status, after_s=6.0
     )
     report = run_flight(rig, Cause.PILOT, *TAKE_OFF, good=True)
     flying, alone, landing = rig.statuses
@@ -449,7 +449,7 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
         assert status["relay"]["alone"] and status["relay"]["sent_hz"] > 0.0 and status["relay"]["last_s"] < 3.0
         assert status["ending"].lower().startswith(CAUSES[Cause.PILOT].phrase)
         assert f"in the air, in mode {mode}" in status["ending"]
-        assert status["who_flies"] == HandoverState.RELEASED
+        assert status["who_flies"] == HandoverState.TAKEN_OVER
     assert report.relay is not None and report.relay.alone
 
 

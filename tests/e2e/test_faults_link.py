@@ -287,7 +287,7 @@ def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
         hand_over.update(HandoverInput(at_ns=later, vehicle=booted, has_setpoint=True)).setpoint_mode
         is SetpointMode.NOTHING
     )
-    assert hand_over.state is HandoverState.RELEASED  # though it says that it is armed, in OFFBOARD
+    assert hand_over.state is HandoverState.TAKEN_OVER  # though it says that it is armed, in OFFBOARD
     items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later + SECOND).items
     assert not events(items)  # told once, and a heartbeat's status alone tells nothing
 

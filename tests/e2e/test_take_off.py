@@ -121,10 +121,10 @@ def test_the_pilot_s_stick_ends_streaming_and_is_never_argued_with(autopilot: st
     flight = TakeOffRig(autopilot).take_off().run(7.0)
     before = flight.commands()
     flight.stick(mode)
-    flight.run(3.0, until=HandoverState.RELEASED)
+    flight.run(3.0, until=HandoverState.TAKEN_OVER)
     released_ns = flight.now_ns
     flight.run(5.0)
-    assert flight.is_in(HandoverState.RELEASED) and flight.commands() == before
+    assert flight.is_in(HandoverState.TAKEN_OVER) and flight.commands() == before
     assert not flight.setpoints_between(released_ns, flight.now_ns)
     flight.run(2.0, stop=True)
     assert flight.loop.finished and flight.commands() == before  # nor asked to land
@@ -177,7 +177,7 @@ def test_a_restarted_vehicle_gets_no_setpoints() -> None:
         young = bytes(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0).pack(mav))
         flight.loop.receive("vehicle", young, flight.now_ns)
     flight.run(0.1)
-    assert flight.is_in(HandoverState.RELEASED) and "vehicle-reboot" in {
+    assert flight.is_in(HandoverState.TAKEN_OVER) and "vehicle-reboot" in {
         event.code for event in flight.memory.of(Event)
     }
 

@@ -56,7 +56,7 @@ def test_the_console_prints_the_notices_of_the_hand_over() -> None:
     flight.run(30.0, until=HandoverState.FAILSAFE)
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
-    flight.run(3.0, until=HandoverState.RELEASED)
+    flight.run(3.0, until=HandoverState.TAKEN_OVER)
     console_file = io.StringIO()
     notices = deque(flight.notices)
     print_notices(notices, Console(file=console_file, width=200))
@@ -96,7 +96,7 @@ def test_the_pilot_s_stick_in_the_climb_is_reported_and_positions_go_on_until_th
     flight.run(30.0, until=HandoverState.CLIMBING)
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
-    flight.run(3.0, until=HandoverState.RELEASED)
+    flight.run(3.0, until=HandoverState.TAKEN_OVER)
     assert [notice.severity for notice in flight.notices if notice.code == "hand-over"] == [Severity.WARNING]
     before = flight.commands()
     flight.run(10.0, stop=True)
@@ -118,7 +118,7 @@ def test_orders_to_fly_are_refused_unless_the_controller_is_engaged(autopilot: s
     flight.run(10.0, until=HandoverState.ENGAGED)
     assert not any(flight.loop.explain_refusal(order) for order in Order)
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
-    flight.run(3.0, until=HandoverState.RELEASED)
+    flight.run(3.0, until=HandoverState.TAKEN_OVER)
     assert all("uavctl ctl engage" in flight.loop.explain_refusal(order) for order in moves)
     assert not flight.loop.explain_refusal(Order.ENGAGE) and not flight.loop.explain_refusal(Order.LAND)
 
@@ -147,7 +147,7 @@ def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switc
     before = flight.commands()
     flight.stick("POSCTL")
     flight.run(4.0)
-    assert flight.is_in(HandoverState.RELEASED) and flight.commands() == before
+    assert flight.is_in(HandoverState.TAKEN_OVER) and flight.commands() == before
     assert flight.peers.autopilot.mode_name == "POSCTL"
 
 

@@ -276,7 +276,7 @@ def test_what_positions_that_are_taken_back_told_of_it_is_forgotten() -> None:
         if state.monitors.release is not None:
             break
     assert state.monitors.release is not None and n > lies + TICKS
-    clean_ns = state.monitors.engaged.clean_ns
+    clean_ns = state.monitors.engaged.consistent_ns
     assert clean_ns is not None and lies * TICK_NS <= clean_ns - START_NS < n * TICK_NS
     assert any(at_ns > clean_ns for at_ns, _ in before.fallback.biases)
     assert state.fallback.biases == tuple(one for one in before.fallback.biases if one[0] <= clean_ns) != ()

@@ -226,10 +226,10 @@ def test_an_acceleration_beyond_the_bound_has_to_persist_and_a_plain_one_has_not
 def test_clean_is_what_nothing_speaks_against(unexplained_mps2: float, off_m: float, apart: bool, clean: bool) -> None:
     known = offsets(0.3) if apart else {}
     watching, _ = look(
-        (unexplained_mps2, 0.0, 0.0), off_m=off_m, vehicle_motion=AT_REST, clean_ns=START_NS - 5, **known
+        (unexplained_mps2, 0.0, 0.0), off_m=off_m, vehicle_motion=AT_REST, consistent_ns=START_NS - 5, **known
     )
     assert (watching.velocity.apart_ns is not None) == apart
-    assert watching.clean_ns == (AT_NS if clean else START_NS - 5)
+    assert watching.consistent_ns == (AT_NS if clean else START_NS - 5)
 
 
 @pytest.mark.parametrize(
@@ -287,7 +287,7 @@ def test_positions_that_are_late_or_close_to_one_another_say_nothing_new(since_n
     after, _ = update(watching, seen(at_ns, sample(START_NS + since_ns, at_ns)), PARAMETERS)
     assert after.motion.observer is not None
     assert (after.motion.observer is not watching.motion.observer) == counts
-    assert after.clean_ns == after.motion.observer.at_ns == START_NS + (since_ns if counts else 0)
+    assert after.consistent_ns == after.motion.observer.at_ns == START_NS + (since_ns if counts else 0)
 
 
 def test_a_stamp_after_the_arrival_counts_as_the_arrival() -> None:
@@ -300,7 +300,7 @@ def test_a_stamp_after_the_arrival_counts_as_the_arrival() -> None:
 )
 def test_after_a_long_silence_the_observer_begins_anew(silent_ns: int, anew: bool) -> None:
     watching, _ = update(INITIAL, seen(START_NS, sample(START_NS)), PARAMETERS)
-    watching = changed(watching, clipped=(True, True), over_ns=START_NS, clean_ns=1)
+    watching = changed(watching, clipped=(True, True), over_ns=START_NS, consistent_ns=1)
     captured_ns, at_ns = START_NS + silent_ns - 30 * MS, START_NS + silent_ns
     far = sample(captured_ns, at_ns, (0.5, 0.0, 0.0))
     after, breach = update(watching, seen(at_ns, far), PARAMETERS)
@@ -308,7 +308,7 @@ def test_after_a_long_silence_the_observer_begins_anew(silent_ns: int, anew: boo
     if anew:
         np.testing.assert_array_equal(after.motion.observer.mean, [[0.5, 0.0, 0.0], ZERO, ZERO])
         np.testing.assert_allclose(np.diagonal(after.motion.observer.cov), [0.0004, 4.0, 4.0 / 9.0])
-        assert (after.acceleration.clipped, after.acceleration.over_ns, after.clean_ns) == ((), None, captured_ns)
+        assert (after.acceleration.clipped, after.acceleration.over_ns, after.consistent_ns) == ((), None, captured_ns)
     else:
         assert after.acceleration.clipped == (True, True, False)
 
@@ -523,8 +523,8 @@ def later(watching: MonitorState, by_ns: int) -> MonitorState:
         ("velocity", "apart_ns"),
     )
     times = {name: at(group, name) + by_ns for group, name in names if at(group, name) is not None}
-    if watching.clean_ns is not None:
-        times["clean_ns"] = watching.clean_ns + by_ns
+    if watching.consistent_ns is not None:
+        times["consistent_ns"] = watching.consistent_ns + by_ns
     if watching.outside.since_ns is not None:
         times["outside_ns"] = watching.outside.since_ns + by_ns
     pairs = (("motion", "sent"), ("motion", "vehicle_path"), ("velocity", "offsets"), ("velocity", "places"))

@@ -449,7 +449,7 @@ def test_a_stamp_after_the_arrival_counts_from_the_arrival() -> None:
 
 def told(history: FilterHistory) -> list[str]:
     """All that is known, to the last bit."""
-    return [repr((history.origin_ns, history.horizon_ns, history.anchor))] + [repr(one) for one in history.entries]
+    return [repr((history.origin_ns, history.window_begin_ns, history.anchor))] + [repr(one) for one in history.entries]
 
 
 @pytest.mark.slow

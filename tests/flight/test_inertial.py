@@ -492,7 +492,7 @@ def test_a_fallback_that_ends_holds_by_nothing() -> None:
     history, _, _ = absorb_samples(kalman, begin_history(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])
     history = update_inertial(kalman, history, felt_at(START_NS + MS, 0.3))
     given = StepInput(tick=1, at_ns=START_NS + TICK_NS, vehicle=vehicle())
-    view = view_filter(history, locate_on_grid(ControlState(), given, controller, carried=False))
+    view = view_filter(history, locate_on_grid(ControlState(), given, controller, is_climbing_or_landing=False))
     ended, origin = Fallback(ControlMode.HOLD, START_NS, FallbackEnd.RELEASED), (0.0, 0.0, 0.0)
     assert view.estimate is not None and not carries_estimate(ended, view.belief)
     assert find_return_accel(ended, origin, view, plant) == (0.0, 0.0, 0.0)

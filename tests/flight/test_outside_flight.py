@@ -25,7 +25,7 @@ from msgspec import structs
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.controller import Controller
-from uavctl.flight.monitors.external import LATE_IN_A_ROW, LONGEST_ANSWER_NS
+from uavctl.flight.monitors.external import MAX_ANSWER_NS, MAX_OVERDUE_ANSWERS
 from uavctl.flight.tick import TickOutput
 from uavctl.records import ControlMode, SolveStatus, StepInput
 from uavctl.smpc.answer import Answer
@@ -88,10 +88,10 @@ def test_a_plan_of_ours_that_fails_plays_out_as_before() -> None:
     [
         ({}, None),
         (dict.fromkeys(range(5, 60, 4), SOON), None),
-        (dict.fromkeys(range(21, 60, 4), LATE), 21 + 4 * (LATE_IN_A_ROW - 1)),
+        (dict.fromkeys(range(21, 60, 4), LATE), 21 + 4 * (MAX_OVERDUE_ANSWERS - 1)),
         ({21: LATE, 25: LATE, 29: SOON, 33: LATE, 37: LATE, 41: SOON}, None),
-        ({21: LONGEST_ANSWER_NS}, None),
-        ({21: LONGEST_ANSWER_NS + 1}, 21),
+        ({21: MAX_ANSWER_NS}, None),
+        ({21: MAX_ANSWER_NS + 1}, 21),
     ],
 )
 def test_one_that_is_late_too_often_or_far_too_late_is_braked(took_ns: dict[int, int], ends_in: int | None) -> None:

@@ -144,19 +144,19 @@ def refused_as(intake: GatedSamples) -> set[str]:
 def test_what_a_stuck_source_said_again_is_taken_back() -> None:
     # From rest it says the same although it is pushed: at first nobody can tell it from one that rounds.
     found = pushed({"stuck": 12}, 40)
-    back = [tick for tick, one in enumerate(found) if one.clean_ns is not None]
+    back = [tick for tick, one in enumerate(found) if one.dropped_after_ns is not None]
     assert len(back) == 1
     (tick,) = back
     assert refused_as(found[tick]) == {EventCode.SAMPLE_FROZEN}
     believed = [n for n in range(13, tick) if found[n].accepted]
     assert believed  # or there was nothing to take back
-    assert found[tick].clean_ns == START_NS + 12 * TICK_NS
+    assert found[tick].dropped_after_ns == START_NS + 12 * TICK_NS
     assert found[tick].consecutive_samples == 0
     assert found[tick - 1].history.captured_ns == START_NS + believed[-1] * TICK_NS
     never = pushed({"stuck": 12}, 40, believes=False)
     assert repr(found[tick].history) == repr(never[tick].history)
     for one in found[tick + 1 :]:
-        assert (refused_as(one), one.clean_ns, one.accepted) == ({EventCode.SAMPLE_FROZEN}, None, ())
+        assert (refused_as(one), one.dropped_after_ns, one.accepted) == ({EventCode.SAMPLE_FROZEN}, None, ())
     assert repr(found[-1].history) == repr(never[-1].history)
 
 
@@ -181,8 +181,8 @@ def test_who_says_that_it_rests_may_be_where_it_was(own: Vec3 | None, at_rest_mp
 def test_what_others_said_meanwhile_is_kept() -> None:
     found = pushed({"good": -1, "stuck": 12}, 40)
     never = pushed({"good": -1, "stuck": 12}, 40, believes=False)
-    back = [tick for tick, one in enumerate(found) if one.clean_ns is not None]
-    assert back and found[back[0]].clean_ns == START_NS + 12 * TICK_NS - MS
+    back = [tick for tick, one in enumerate(found) if one.dropped_after_ns is not None]
+    assert back and found[back[0]].dropped_after_ns == START_NS + 12 * TICK_NS - MS
     assert repr(found[-1].history) == repr(never[-1].history)
     assert found[-1].history.captured_ns == START_NS + 39 * TICK_NS
 
@@ -213,7 +213,7 @@ def test_a_stale_value_whose_first_sample_was_lost_is_taken_back_as_soon_as_it_c
     assert found[14].history.captured_ns == START_NS + 14 * TICK_NS
     assert refused_as(found[15]) == {EventCode.SAMPLE_REPEATED}
     # The newest position that is left: a plan made since is outdated by it.
-    assert found[15].clean_ns == START_NS + 9 * TICK_NS
+    assert found[15].dropped_after_ns == START_NS + 9 * TICK_NS
     assert found[15].history.captured_ns == START_NS + 9 * TICK_NS
     assert found[15].history.newest.belief is not None and never[15].history.newest.belief is not None
     assert found[17].history.captured_ns == never[17].history.captured_ns
@@ -222,7 +222,7 @@ def test_a_stale_value_whose_first_sample_was_lost_is_taken_back_as_soon_as_it_c
 def test_a_value_whose_first_sample_cannot_have_been_lost_stays() -> None:
     found = flown_on({**BEFORE, 10: BEFORE[9] + 0.03, 15: BEFORE[9] + 0.03}, 16)
     assert refused_as(found[15]) == {EventCode.SAMPLE_REPEATED}
-    assert found[15].clean_ns is None
+    assert found[15].dropped_after_ns is None
     assert found[15].history.captured_ns == START_NS + 10 * TICK_NS
 
 
@@ -232,4 +232,4 @@ def test_the_first_value_of_all_is_watched_and_stays_where_nothing_else_is_known
     assert refused_as(found[18]) <= {EventCode.SAMPLE_REPEATED, EventCode.SAMPLE_FROZEN}
     assert refused_as(found[18])
     assert found[18].history.captured_ns == START_NS
-    assert found[18].clean_ns is None
+    assert found[18].dropped_after_ns is None

@@ -125,7 +125,7 @@ def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit
     def taking_back(*arguments: Any) -> measure.GatedSamples:
         intake = gate_samples(*arguments)
         tick = arguments[4].tick
-        return replace(intake, clean_ns=START_NS + 3 * DT_NS - 60 * MS) if tick == 4 * TICKS + 1 else intake
+        return replace(intake, dropped_after_ns=START_NS + 3 * DT_NS - 60 * MS) if tick == 4 * TICKS + 1 else intake
 
     solver = StubSolver(small_plant(), 20)
     inputs = make_inputs(range(12 * TICKS), make_motion_samples(3))

@@ -22,7 +22,7 @@ def test_the_drawing_has_every_transition_once() -> None:
     lines = drawing().splitlines()
     transitions = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
     assert sum("-->" in line for line in lines) == len(transitions) + 3  # the beginning, two ends
-    assert "    RELEASED --> RETURNING: engage" in lines
+    assert "    TAKEN_OVER --> RETURNING: engage" in lines
 
 
 def test_page_lists_every_topic_and_field() -> None:

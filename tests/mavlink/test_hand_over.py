@@ -40,7 +40,7 @@ def test_no_neutral_stream_before_the_controller_is_ready() -> None:
 
 @pytest.mark.fault(25)
 @pytest.mark.parametrize(
-    ("mode", "armed", "after"), [("POSCTL", True, HandoverState.RELEASED), ("OFFBOARD", False, HandoverState.DONE)]
+    ("mode", "armed", "after"), [("POSCTL", True, HandoverState.TAKEN_OVER), ("OFFBOARD", False, HandoverState.DONE)]
 )
 def test_the_pilot_takes_over_for_good(mode: str, armed: bool, after: HandoverState) -> None:
     rig = HandoverRig().advance_to(HandoverState.ENGAGED)
@@ -83,7 +83,7 @@ def test_what_the_controller_may_fly() -> None:
     assert flown(NOW, None) is None
     assert rig.vehicle is not None and flown(NOW, rig.vehicle) == rig.vehicle
     assert flown(NOW + HEARTBEAT_TIMEOUT_NS + 1, rig.vehicle) is None
-    rig.advance_to(HandoverState.RELEASED)
+    rig.advance_to(HandoverState.TAKEN_OVER)
     rig.report_status(mode="OFFBOARD")
     seen = flown(rig.view.at_ns, rig.vehicle)
     assert seen is not None and not seen.external and "released" in seen.mode
@@ -196,7 +196,7 @@ def test_px4_that_stops_below_the_height_is_flown_from_there_and_one_that_never_
 
 
 @pytest.mark.parametrize(
-    "state", [HandoverState.MODE, HandoverState.ENGAGED, HandoverState.RELEASED, HandoverState.LANDING]
+    "state", [HandoverState.MODE, HandoverState.ENGAGED, HandoverState.TAKEN_OVER, HandoverState.LANDING]
 )
 def test_take_off_is_ordered_once_and_on_the_ground(state: HandoverState) -> None:
     rig = HandoverRig().advance_to(state)
@@ -277,7 +277,7 @@ def test_a_second_vehicle_on_the_way_ends_it(state: HandoverState) -> None:
 
 @pytest.mark.fault(25)
 def test_engaging_again_takes_an_order_and_a_vehicle_in_the_air() -> None:
-    rig = HandoverRig().advance_to(HandoverState.RELEASED)
+    rig = HandoverRig().advance_to(HandoverState.TAKEN_OVER)
     told = rig.tick(commands=(ENGAGE,))
     assert (rig.state, told.request, told.setpoint_mode) == (
         HandoverState.RETURNING,
@@ -290,7 +290,7 @@ def test_engaging_again_takes_an_order_and_a_vehicle_in_the_air() -> None:
 
 
 def test_engaging_a_vehicle_that_is_back_by_itself_asks_for_nothing() -> None:
-    rig = HandoverRig().advance_to(HandoverState.RELEASED)
+    rig = HandoverRig().advance_to(HandoverState.TAKEN_OVER)
     rig.report_status(mode="OFFBOARD")
     rig.tick(commands=(ENGAGE,))
     assert rig.tick().setpoint_mode is FLY and not rig.asked
@@ -299,11 +299,11 @@ def test_engaging_a_vehicle_that_is_back_by_itself_asks_for_nothing() -> None:
 @pytest.mark.parametrize(
     ("state", "fields", "view", "why"),
     [
-        (HandoverState.RELEASED, {"landed": True}, {}, "not in the air"),
-        (HandoverState.RELEASED, {}, {"arming_refusal": "no position"}, "no position"),
+        (HandoverState.TAKEN_OVER, {"landed": True}, {}, "not in the air"),
+        (HandoverState.TAKEN_OVER, {}, {"arming_refusal": "no position"}, "no position"),
         (HandoverState.ENGAGED, {}, {}, "nothing to engage"),
         (HandoverState.READY, {}, {}, "not in the air"),
-        (HandoverState.RELEASED, {"autopilot": "unknown"}, {}, "no vehicle"),
+        (HandoverState.TAKEN_OVER, {"autopilot": "unknown"}, {}, "no vehicle"),
     ],
 )
 def test_engaging_is_refused_with_the_reason(
@@ -319,7 +319,7 @@ def test_engaging_is_refused_with_the_reason(
 
 @pytest.mark.fault(25)
 @pytest.mark.parametrize(
-    ("mode", "armed", "after"), [("ALTCTL", True, HandoverState.RELEASED), ("POSCTL", False, HandoverState.DONE)]
+    ("mode", "armed", "after"), [("ALTCTL", True, HandoverState.TAKEN_OVER), ("POSCTL", False, HandoverState.DONE)]
 )
 def test_the_pilot_may_break_off_the_return(mode: str, armed: bool, after: HandoverState) -> None:
     rig = HandoverRig().advance_to(HandoverState.RETURNING)
@@ -331,7 +331,7 @@ def test_the_pilot_may_break_off_the_return(mode: str, armed: bool, after: Hando
 def test_a_return_that_is_refused_leaves_the_pilot_in_charge() -> None:
     rig = HandoverRig().advance_to(HandoverState.RETURNING)
     rig.answer(DENIED, text="no way")
-    assert rig.is_in(HandoverState.RELEASED) and not rig.hand_over.failure and not rig.hand_over.is_finished
+    assert rig.is_in(HandoverState.TAKEN_OVER) and not rig.hand_over.failure and not rig.hand_over.is_finished
     assert "DENIED" in rig.codes("refused")[0] and "no way" in rig.codes("refused")[0]
 
 

@@ -54,10 +54,10 @@ def test_with_his_switch_or_in_a_mode_that_a_person_flies_it_is_not_waited_for(
 ) -> None:
     rig = HandoverRig().advance_to(state)
     rig.report_status(mode=mode, failsafe=failsafe, stick=not failsafe)
-    assert rig.tick().setpoint_mode is NOTHING and rig.is_in(HandoverState.RELEASED)
+    assert rig.tick().setpoint_mode is NOTHING and rig.is_in(HandoverState.TAKEN_OVER)
     rig.report_status(mode="AUTO.TAKEOFF", failsafe=False)
     rig.run(60.0)
-    assert rig.is_in(HandoverState.RELEASED)  # for good
+    assert rig.is_in(HandoverState.TAKEN_OVER)  # for good
 
 
 @pytest.mark.fault(61)
@@ -113,7 +113,7 @@ def test_a_pilot_who_takes_over_in_the_very_tick_in_which_time_is_up_is_not_land
     assert rig.is_in(HandoverState.FAILSAFE)
     rig.report_status(mode="POSCTL", failsafe=False)
     rig.run(1.0)
-    assert rig.is_in(HandoverState.RELEASED) and RequestKind.LAND not in [ask for _, ask in rig.asked]
+    assert rig.is_in(HandoverState.TAKEN_OVER) and RequestKind.LAND not in [ask for _, ask in rig.asked]
 
 
 @pytest.mark.fault(8, 61)
@@ -165,7 +165,7 @@ def test_ardupilot_stays_in_the_failsafe_s_mode_when_it_has_ended() -> None:
     assert rig.is_in(HandoverState.FAILSAFE)
     rig.report_status(mode="STABILIZE")
     rig.tick()
-    assert rig.is_in(HandoverState.RELEASED)
+    assert rig.is_in(HandoverState.TAKEN_OVER)
 
 
 @pytest.mark.fault(28)
@@ -173,7 +173,7 @@ def test_ardupilot_stays_in_the_failsafe_s_mode_when_it_has_ended() -> None:
 def test_a_flight_that_the_pilot_began_is_the_pilot_s_in_a_failsafe_too(autopilot: str) -> None:
     rig = HandoverRig(autopilot).advance_to(HandoverState.ENGAGED)
     rig.fail()
-    assert rig.is_in(HandoverState.RELEASED)
+    assert rig.is_in(HandoverState.TAKEN_OVER)
 
 
 # While it is in the air by our positions
@@ -228,7 +228,7 @@ def test_a_pilot_who_flies_by_our_positions_keeps_them_until_the_ground() -> Non
     rig = over_a_relay(HandoverState.CLIMBING)
     rig.report_status(mode="POSCTL")
     rig.tick()
-    assert rig.is_in(HandoverState.RELEASED) and rig.hand_over.is_busy
+    assert rig.is_in(HandoverState.TAKEN_OVER) and rig.hand_over.is_busy
     rig.report_status(landed=True)
     rig.tick()
     assert not rig.hand_over.is_busy

@@ -41,7 +41,7 @@ def test_once_a_landing_is_shown_any_other_mode_is_the_pilot_s(autopilot: str, m
     rig.run(0.3)
     rig.report_status(mode=mode)
     rig.run(70.0)
-    assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
+    assert rig.is_in(HandoverState.TAKEN_OVER) and len(rig.asked) == asked
 
 
 def test_a_failsafe_that_only_seemed_to_land_for_us_is_asked_again() -> None:
@@ -80,7 +80,7 @@ def test_after_landing_was_granted_another_mode_is_the_pilot_s(autopilot: str, m
     assert rig.is_in(HandoverState.LANDING)
     rig.report_status(mode=mode)
     rig.run(10.0)
-    assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
+    assert rig.is_in(HandoverState.TAKEN_OVER) and len(rig.asked) == asked
 
 
 @pytest.mark.fault(68)
@@ -91,7 +91,7 @@ def test_the_mode_of_before_is_the_pilot_s_once_landing_would_have_shown() -> No
     rig.run(1.9)  # a vehicle may be slow
     assert rig.is_in(HandoverState.LANDING)
     rig.run(10.0)
-    assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
+    assert rig.is_in(HandoverState.TAKEN_OVER) and len(rig.asked) == asked
 
 
 @pytest.mark.fault(68)
@@ -107,7 +107,7 @@ def test_px4_s_hold_while_it_stands_armed_is_the_pilot_s() -> None:
     rig = HandoverRig("px4").advance_to(HandoverState.CLIMBING)
     rig.report_status(mode="AUTO.LOITER", stick=True)
     rig.tick()
-    assert rig.is_in(HandoverState.RELEASED)
+    assert rig.is_in(HandoverState.TAKEN_OVER)
 
 
 @pytest.mark.fault(68)
@@ -125,10 +125,10 @@ def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
     rig = HandoverRig().advance_to(HandoverState.ARMING)
     rig.report_status(mode="AUTO.LOITER", stick=True)
     rig.tick()
-    assert rig.is_in(HandoverState.RELEASED)
+    assert rig.is_in(HandoverState.TAKEN_OVER)
     rig.report_status(armed=True)
     rig.run(30.0)
-    assert rig.is_in(HandoverState.RELEASED)
+    assert rig.is_in(HandoverState.TAKEN_OVER)
 
 
 @pytest.mark.fault(66)
@@ -174,7 +174,7 @@ def test_an_end_that_comes_with_the_pilot_s_switch_asks_for_nothing(
     else:
         rig.tick(commands=(LAND,))
     rig.run(5.0)
-    assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
+    assert rig.is_in(HandoverState.TAKEN_OVER) and len(rig.asked) == asked
 
 
 @pytest.mark.fault(67)

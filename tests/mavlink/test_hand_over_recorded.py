@@ -220,12 +220,12 @@ def test_px4_whose_failsafe_ends_in_the_climb_is_flown_after_all_and_the_pilot_s
     # Its client had let go for good, so it never went into OFFBOARD by itself: that is waited for.
     flown = fly("px4-failsafe-in-climb.tlog", 1.2, orders, HandOverConfig(engage_s=60.0, tries=100), client=245)
     taken_back = [HandoverState.FAILSAFE, C, G]
-    by_stick = [HandoverState.RELEASED, HandoverState.RETURNING, E, HandoverState.RELEASED]
+    by_stick = [HandoverState.TAKEN_OVER, HandoverState.RETURNING, E, HandoverState.TAKEN_OVER]
     assert [state for state, _ in flown.states] == [R, M, A, C, *taken_back, *by_stick]
     failed_s, back_s = flown.at(HandoverState.FAILSAFE), flown.at(C, 1)
     assert back_s - failed_s == pytest.approx(1.0, abs=0.2)
     assert flown.at(G) - back_s < 8.0  # as soon as it has climbed
-    pilot_s = [flown.at(HandoverState.RELEASED, number) - failed_s for number in (0, 1)]
+    pilot_s = [flown.at(HandoverState.TAKEN_OVER, number) - failed_s for number in (0, 1)]
     assert pilot_s == pytest.approx([41.0, 56.0], abs=0.3)
     between = [sending for sending, time_s in flown.sent if failed_s <= time_s < back_s]
     assert between == [SetpointMode.NOTHING] and RequestKind.LAND not in [ask for ask, _ in flown.asked]
@@ -275,6 +275,6 @@ def test_px4_s_descend_is_its_failsafe(asks: bool) -> None:
 @pytest.mark.fault(25)
 def test_arducopter_s_pilot_who_takes_loiter_is_the_pilot() -> None:
     flown = fly("arducopter-pilot.tlog", 1.2, {(4.0, 0.0, 0.0): "take off"}, HandOverConfig(), client=245)
-    assert [state for state, _ in flown.states][:7] == [R, M, A, C, G, E, HandoverState.RELEASED]
+    assert [state for state, _ in flown.states][:7] == [R, M, A, C, G, E, HandoverState.TAKEN_OVER]
     assert set(flown.who) == {ModeReason.PILOT} and RequestKind.LAND not in [ask for ask, _ in flown.asked]
     assert flown.ending is not None and (flown.ending.code, flown.ending.exit_code) == (Cause.PILOT, 0)

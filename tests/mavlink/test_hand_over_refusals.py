@@ -158,7 +158,7 @@ def test_the_pilot_may_take_over_at_any_time(state: HandoverState, mode: str, ar
     rig = HandoverRig("px4").advance_to(state)
     rig.report_status(mode=mode, armed=armed, stick=True)
     told = rig.tick()
-    assert (rig.state, told.setpoint_mode, told.request) == (HandoverState.RELEASED, NOTHING, None)
+    assert (rig.state, told.setpoint_mode, told.request) == (HandoverState.TAKEN_OVER, NOTHING, None)
 
 
 @pytest.mark.fault(25)
@@ -171,7 +171,7 @@ def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> Non
         assert rig.tick().setpoint_mode is FLY
     assert rig.tick().setpoint_mode is NOTHING
     assert (
-        rig.is_in(HandoverState.RELEASED)
+        rig.is_in(HandoverState.TAKEN_OVER)
         and rig.vehicle is not None
         and rig.hand_over.has_left_external_mode(rig.vehicle)
     )
@@ -189,7 +189,7 @@ def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> Non
         (HandoverState.CLIMBING, HandoverState.LANDING, RequestKind.LAND),
         (HandoverState.ENGAGING, HandoverState.LANDING, RequestKind.LAND),
         (HandoverState.FAILSAFE, HandoverState.LANDING, RequestKind.LAND),
-        (HandoverState.RETURNING, HandoverState.RELEASED, None),
+        (HandoverState.RETURNING, HandoverState.TAKEN_OVER, None),
     ],
 )
 @pytest.mark.parametrize("how", ["stop", "order"])
@@ -234,8 +234,8 @@ def test_landing_is_asked_for_once_a_second_five_times_at_most() -> None:
         (HandoverState.CLIMBING, HandoverState.FAILED),
         (HandoverState.ENGAGING, HandoverState.FAILED),
         (HandoverState.FAILSAFE, HandoverState.FAILED),
-        (HandoverState.RETURNING, HandoverState.RELEASED),
-        (HandoverState.ENGAGED, HandoverState.RELEASED),
+        (HandoverState.RETURNING, HandoverState.TAKEN_OVER),
+        (HandoverState.ENGAGED, HandoverState.TAKEN_OVER),
     ],
 )
 def test_a_reboot_disengages(state: HandoverState, after: HandoverState) -> None:

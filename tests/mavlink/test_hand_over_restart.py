@@ -43,7 +43,7 @@ def test_a_vehicle_that_was_left_in_flight_gets_nothing_until_ordered(autopilot:
     assert seen is not None and not seen.external  # not for the controller, either
     for _ in range(200):
         assert rig.tick().setpoint_mode is NOTHING
-    assert rig.is_in(HandoverState.RELEASED) and not rig.asked
+    assert rig.is_in(HandoverState.TAKEN_OVER) and not rig.asked
     assert "uavctl ctl engage" in rig.codes("refused")[0] and len(rig.codes("refused")) == 1
     told = rig.tick(commands=(ENGAGE,))
     external = mode in ("OFFBOARD", "GUIDED")
@@ -98,10 +98,10 @@ def found_armed(up_s: float | None, at_ns: int) -> HandoverRig:
 @pytest.mark.parametrize(
     ("since_s", "up_s", "state"),
     [
-        (20.0, 25.0, HandoverState.RELEASED),  # it was up before that flight began
+        (20.0, 25.0, HandoverState.TAKEN_OVER),  # it was up before that flight began
         (20.0, 15.0, HandoverState.ENGAGED),  # and has started since
-        (20.0, 15.3, HandoverState.RELEASED),  # or may only have a slow clock
-        (3000.0, 2600.0, HandoverState.RELEASED),
+        (20.0, 15.3, HandoverState.TAKEN_OVER),  # or may only have a slow clock
+        (3000.0, 2600.0, HandoverState.TAKEN_OVER),
         (20.0, 0.5, HandoverState.ENGAGED),
     ],
 )
@@ -118,7 +118,7 @@ def test_its_clock_is_waited_for_with_nothing_sent() -> None:
         seen = rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle)
         assert seen is not None and not seen.external
     rig.tick()
-    assert rig.is_in(HandoverState.RELEASED) and not rig.asked
+    assert rig.is_in(HandoverState.TAKEN_OVER) and not rig.asked
     rig = found_armed(None, FLOWN_NS + 60 * SECOND)
     rig.tick(uptime_s=10.0)
     assert rig.is_in(HandoverState.ENGAGED)
@@ -180,7 +180,7 @@ def test_a_killed_flight_is_not_taken_up_by_the_next_loop_and_is_when_asked(auto
     air.run(None, dead_s)
     loop, memory = air.begin(Command(order=Order.STAND_BY, flown_ns=0))
     air.run(loop, 5.0)
-    assert not memory.of(Setpoint) and loop.handover_state is HandoverState.RELEASED
+    assert not memory.of(Setpoint) and loop.handover_state is HandoverState.TAKEN_OVER
     if autopilot == "px4":
         assert air.peers.autopilot.mode_name != "OFFBOARD"  # its failsafe has it
     loop.order(Command(order=Order.ENGAGE))

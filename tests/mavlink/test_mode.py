@@ -52,14 +52,16 @@ def test_setpoints_are_sent_by_who_is_engaged_only() -> None:
     assert flying == {
         (HandoverState.ENGAGED, seen) for seen in (HandoverEvent.EXTERNAL, HandoverEvent.GRANTED, HandoverEvent.SILENCE)
     }
-    assert TRANSITIONS[HandoverState.ENGAGED, HandoverEvent.OTHER] == (HandoverState.RELEASED, SetpointMode.NOTHING)
+    assert TRANSITIONS[HandoverState.ENGAGED, HandoverEvent.OTHER] == (HandoverState.TAKEN_OVER, SetpointMode.NOTHING)
 
 
 @pytest.mark.fault(25)
 def test_only_an_order_leads_out_of_released_and_towards_arming() -> None:
-    out = {seen for seen in HandoverEvent if TRANSITIONS[HandoverState.RELEASED, seen][0] is not HandoverState.RELEASED}
+    out = {
+        seen for seen in HandoverEvent if TRANSITIONS[HandoverState.TAKEN_OVER, seen][0] is not HandoverState.TAKEN_OVER
+    }
     assert out == {HandoverEvent.ENGAGE, HandoverEvent.DISARMED}
-    assert TRANSITIONS[HandoverState.WAITING, HandoverEvent.LEFT] == (HandoverState.RELEASED, SetpointMode.NOTHING)
+    assert TRANSITIONS[HandoverState.WAITING, HandoverEvent.LEFT] == (HandoverState.TAKEN_OVER, SetpointMode.NOTHING)
     towards = {seen for (before, seen), (after, _) in TRANSITIONS.items() if before is not after is HandoverState.MODE}
     assert towards == {HandoverEvent.TAKE_OFF}
 
@@ -75,7 +77,7 @@ def test_no_way_leads_back_from_landing_into_flight() -> None:
     assert reached == {
         HandoverState.LANDING,
         HandoverState.SETTLING,
-        HandoverState.RELEASED,
+        HandoverState.TAKEN_OVER,
         HandoverState.DONE,
         HandoverState.FAILED,
     }

@@ -17,7 +17,7 @@ from uavctl.config.connections import RelayConfig
 from uavctl.frames import quaternion_from_euler
 from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
+from uavctl.mavlink.relay import FROZEN_POSES, MAX_AGE_NS, Pose, Relay
 from uavctl.records import Event, LinkStats, PositionSample, Vec3
 
 NOW = 1_000 * SECOND
@@ -74,7 +74,7 @@ def test_stale_late_and_refused_positions_stay_here() -> None:
     refused = sample(NOW + 40 * MS, 1.2, 1.0, 0.0)
     one.add_sample(refused, LEVEL)
     assert one.due(NOW + 50 * MS, offset_ns=0, refused=(refused,)) == ()
-    assert kept(one) == {"stale": 1, "late": 1, "refused": 1}
+    assert kept(one) == {"old": 1, "out of order": 1, "refused": 1}
 
 
 def test_a_frozen_pose_is_stuck_until_it_changes() -> None:
@@ -83,7 +83,7 @@ def test_a_frozen_pose_is_stuck_until_it_changes() -> None:
         at_ns = NOW + n * 50 * MS
         one.add_sample(sample(at_ns, received_ns=at_ns), LEVEL)
         sent += len(one.due(at_ns, offset_ns=0, refused=()))
-    assert (sent, kept(one)) == (STUCK_AFTER, {"stuck": 60 - STUCK_AFTER})
+    assert (sent, kept(one)) == (FROZEN_POSES, {"frozen": 60 - FROZEN_POSES})
     at_ns = NOW + 60 * 50 * MS
     one.add_sample(sample(at_ns, 1.0, 2.0, -0.51, received_ns=at_ns), LEVEL)
     assert len(one.due(at_ns, offset_ns=0, refused=())) == 1

@@ -37,11 +37,11 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     broken: list[bool] = []
 
     def faulty(
-        state: ControlState, inp: StepInput, controller: Controller, *, carried: bool
+        state: ControlState, inp: StepInput, controller: Controller, *, is_climbing_or_landing: bool
     ) -> tuple[ControlState, TickOutput]:
         if broken:
             raise ArithmeticError("the core is broken")
-        return run_tick(state, inp, controller, carried=carried)
+        return run_tick(state, inp, controller, is_climbing_or_landing=is_climbing_or_landing)
 
     monkeypatch.setattr(control, "run_tick", faulty)
     return lambda: broken.append(True)
@@ -92,7 +92,7 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
     fail = failing(monkeypatch)
     flight = airborne("px4")
     flight.stick("POSCTL")
-    flight.run(3.0, until=HandoverState.RELEASED)
+    flight.run(3.0, until=HandoverState.TAKEN_OVER)
     before, failed_ns = flight.commands(), flight.now_ns
     fail()
     flight.run(8.0)
@@ -132,7 +132,7 @@ def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(m
 def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopilot: str) -> None:
     flight = airborne(autopilot, f"hand_over.land_s={LAND_S}")
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
-    flight.run(3.0, until=HandoverState.RELEASED)
+    flight.run(3.0, until=HandoverState.TAKEN_OVER)
     flight.run(8.0 * LAND_S, stop=True)
     assert flight.loop.is_relay_needed and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)

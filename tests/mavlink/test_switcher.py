@@ -283,7 +283,7 @@ def test_unknown_in_a_mode_that_flies_by_itself_is_landed_in_bounded_time_unless
     pilots.run(5.0)
     pilots.report_status(stick=True)
     pilots.run(60.0)
-    assert pilots.is_in(HandoverState.RELEASED) and not landings(pilots)
+    assert pilots.is_in(HandoverState.TAKEN_OVER) and not landings(pilots)
 
 
 @pytest.mark.fault(28, 61)
@@ -328,7 +328,7 @@ def test_whoever_it_was_nothing_flies_it_and_by_order_only_is_it_asked_for(autop
         rig.report_status(mode=mode, stick=stick, landed=False, **said)
         sent = {rig.tick().setpoint_mode for _ in range(80)}
         assert sent == {NOTHING} and len(rig.asked) == asked, (state, mode, stick, said)
-        assert rig.is_in(HandoverState.RELEASED, HandoverState.FAILSAFE, HandoverState.UNCLEAR), (
+        assert rig.is_in(HandoverState.TAKEN_OVER, HandoverState.FAILSAFE, HandoverState.UNCLEAR), (
             rig.state,
             state,
             mode,

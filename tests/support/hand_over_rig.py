@@ -94,7 +94,7 @@ class HandoverRig:
             state
             in (
                 HandoverState.ENGAGED,
-                HandoverState.RELEASED,
+                HandoverState.TAKEN_OVER,
                 HandoverState.RETURNING,
                 HandoverState.LANDING,
                 HandoverState.SETTLING,
@@ -132,7 +132,7 @@ class HandoverRig:
         return self.tick()
 
     def _beyond(self, state: HandoverState) -> HandoverRig:
-        if state in (HandoverState.RELEASED, HandoverState.RETURNING):
+        if state in (HandoverState.TAKEN_OVER, HandoverState.RETURNING):
             self.report_status(mode="POSCTL")
             self.tick()
         if state is HandoverState.RETURNING:

@@ -25,7 +25,7 @@ _MAX_STEP_DEVIATION, _MIN_REGULAR_SHARE = (
     0.8,
 )  # of a period off a whole number of them; part of the steps that has to be so
 _NOISE_FACTOR = 2.0
-_STUCK_SAMPLES = 20
+_FROZEN_SAMPLES = 20  # in a row: noise repeats one less than twice, a lost body repeats for as long as it is lost
 _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres"))
 # A camera system that is listened to without a bridge has its own settings for axes, and its unit is known.
 CAMERA_AXES = (
@@ -41,7 +41,7 @@ def check_positions(data: CheckData, config: Config, at_ns: int) -> list[Item]:
     period_s = _estimate_period_s(captured_s)
     items = [_check_rate(data.samples, period_s, config), _check_gaps(data, config, at_ns), _check_age(data, config)]
     items.append(_check_loss(captured_s, config))
-    items += [_check_noise(data.samples, config), _check_room(data.samples, config), _check_stuck(data)]
+    items += [_check_noise(data.samples, config), _check_room(data.samples, config), _check_frozen(data)]
     units = sorted({unit for stats in data.stats.values() for unit in stats.stamp_units})
     return [*items, _describe_units(units)] if units else items
 
@@ -245,14 +245,14 @@ def _is_inside(position: list[float], limits: dict[str, tuple[float, float]], ma
     return all(low - margin_m <= value <= high + margin_m for value, low, high in sides)
 
 
-def _check_stuck(data: CheckData) -> Item:
+def _check_frozen(data: CheckData) -> Item:
     positions = [sample.position_m for sample in data.samples]
     run = longest = 1
     for a, b in pairwise(positions):
         run = run + 1 if a == b else 1
         longest = max(longest, run)
-    name, want = "position stuck", f"no {_STUCK_SAMPLES} positions in a row the same to the last bit"
-    if longest < _STUCK_SAMPLES:
+    name, want = "position frozen", f"no {_FROZEN_SAMPLES} positions in a row the same to the last bit"
+    if longest < _FROZEN_SAMPLES:
         return make_item(name, ItemState.GOOD, f"at most {longest} in a row the same", want)
     hint = "cameras have noise: does the source repeat the last pose of a body that it has lost?"
     return make_item(name, ItemState.UNDETERMINED, f"{longest} in a row the same", want, f"{hint} Move the body to see")

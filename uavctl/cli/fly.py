@@ -75,10 +75,10 @@ def fly(
     live: Live = False,
     live_port: LivePort = None,
 ) -> int:
-    """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C hands it back.
+    """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C brakes, then lands it.
 
-    With --arm --takeoff HEIGHT the vehicle on the ground is armed, climbs by itself, and is flown from there; the end,
-    by Ctrl-C or --duration, is its landing.
+    Ctrl-C and the end of --duration brake and hold; then the vehicle lands, or the pilot takes it (`fallback.land`).
+    With --arm --takeoff HEIGHT the vehicle on the ground is armed, climbs by itself, and is flown from there.
 
     Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot
     switches. When the pilot leaves the mode, streaming stops at once and does not come back.
@@ -168,7 +168,8 @@ def fly_daemon(
                     print_message(label_text("warning", warning))
                 if vehicle_lock.left_flight_ns is not None:
                     order_stand_by(loop, vehicle_lock.left_flight_ns)
-                print_message(f"recording to {path}; Ctrl-C hands over")
+                on_stop = "brakes and lands" if config.fallback.land else "brakes, then leaves the vehicle to the pilot"
+                print_message(f"recording to {path}; Ctrl-C {on_stop}")
                 with (
                     show_live_line(loop, recorder.status, duration_s, config.daemon.tick_s) as feed,
                     run_services(loop, config, path, recorder.status, listener) as service_functions,

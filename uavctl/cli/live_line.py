@@ -108,7 +108,7 @@ def show_live_line(
     previous_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     columns = (BarColumn(bar_width=20), TimeElapsedColumn(), _StateColumn())
-    done, let_go_shown = threading.Event(), threading.Event()
+    done, release_shown = threading.Event(), threading.Event()
     with Progress(
         *columns, console=make_message_console(), transient=True, refresh_per_second=1 / REFRESH_S
     ) as progress:
@@ -128,9 +128,9 @@ def show_live_line(
                 print_events()
                 ticked = feed.ticked
                 print_notices(feed.notices, console)
-                if loop.let_go and not let_go_shown.is_set():
-                    let_go_shown.set()
-                    console.print(label_text("letting go", loop.let_go, "bold red"), soft_wrap=True)
+                if loop.release_reason and not release_shown.is_set():
+                    release_shown.set()
+                    console.print(label_text("letting go", loop.release_reason, "bold red"), soft_wrap=True)
                 if ticked is not None:
                     line = _format_state(ticked, loop.handover_state) + _format_recorder_warning(get_status())
                     progress.update(task, completed=ticked.decision.tick * tick_s, line=line)

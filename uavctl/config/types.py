@@ -390,7 +390,8 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
             ge=0.001,
             le=1e6,
             description="a position further from the prediction than this many standard deviations, gate_m, and what "
-            "inputs can have done since the newest one, counts as lost",
+            "inputs can have done since the newest one, counts as lost; a position that repeats is frozen once the "
+            "prediction by inputs alone is as far from it",
         ),
     ] = 6.0
     gate_m: Annotated[
@@ -500,7 +501,7 @@ Bound = Annotated[float, Meta(gt=0, le=1e6)] | None
 
 
 class EnvelopeConfig(Section, frozen=True, kw_only=True):
-    """Bounds of what is possible in flight; beyond them the vehicle is let go: level, and its own landing."""
+    """Bounds of what is possible in flight; beyond them the vehicle is released: level, then its own landing."""
 
     outside_m: Annotated[
         Bound,

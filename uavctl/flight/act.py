@@ -49,12 +49,12 @@ def act(
     """Make the setpoint of a tick, and note it in the filter."""
     controller, history, at_ns = context.controller, supervised.view.history, context.at_ns
     setpoint, applied = _make_setpoint(state, context, supervised, decided)
-    acting, pending_inputs = None if context.unready else applied, measured.pending_inputs
+    acting, pending_inputs = None if context.not_ready_reason else applied, measured.pending_inputs
     if controller.dead_ns:
         pending_inputs = (*pending_inputs, (at_ns + controller.dead_ns, acting))
     else:
         history = note_input(controller.kalman, history, at_ns, acting, supervised.view.belief)
-    drop_after_ns = supervised.drop_after_ns
+    drop_after_ns = supervised.drop_later_after_ns
     if drop_after_ns is not None:
         history = drop_samples(controller.kalman, history, lambda sample: read_capture_ns(sample) > drop_after_ns)
     return Acted(setpoint, applied, history, pending_inputs)
@@ -66,7 +66,7 @@ def _make_setpoint(
     """Make the setpoint after the last gate, and the input (n_u,) that it is."""
     controller, source, fallback, plan = context.controller, _SOURCES.get(decided.mode), decided.fallback, decided.plan
     nothing_known = supervised.view.estimate is None and fallback is None
-    if decided.is_mute or source is None or nothing_known:
+    if decided.sends_nothing or source is None or nothing_known:
         return None, None
     wanted = ZERO
     if fallback is not None:

@@ -29,13 +29,13 @@ class TickContext(msgspec.Struct, frozen=True, eq=False):
 
     inputs: StepInput
     controller: Controller
-    carried: bool  # whether the vehicle is on its way up or down at our request
+    is_climbing_or_landing: bool  # whether the vehicle is on its way up or down at our request
     step: int  # k
     boundary_ns: int  # when step k began [ns]
     is_boundary: bool  # whether this is the first tick of its step that runs
     mode: ControlMode  # mode of the tick before
     is_flown: bool  # whether we flew in the tick before
-    unready: str  # why the vehicle takes no setpoints; empty if it does
+    not_ready_reason: str  # why the vehicle takes no setpoints; empty if it does
     is_ours: bool  # whether the vehicle is in the air and takes setpoints, as far as it is known
 
     @property
@@ -53,26 +53,28 @@ class FilterView(msgspec.Struct, frozen=True, eq=False):
     age_steps: int | None  # age of information: boundary minus capture, in whole Δt
 
 
-def locate_on_grid(state: ControlState, inputs: StepInput, controller: Controller, carried: bool) -> TickContext:
+def locate_on_grid(
+    state: ControlState, inputs: StepInput, controller: Controller, is_climbing_or_landing: bool
+) -> TickContext:
     """Find the place of a tick on the grid."""
     # k = n div (Δt / tick)
     step, into = divmod(inputs.tick, controller.ticks_per_step)
-    mode, unready, vehicle = state.mode, describe_unready(inputs.vehicle), inputs.vehicle
+    mode, unready, vehicle = state.mode, describe_not_ready(inputs.vehicle), inputs.vehicle
     return TickContext(
         inputs=inputs,
         controller=controller,
-        carried=carried,
+        is_climbing_or_landing=is_climbing_or_landing,
         step=step,
         boundary_ns=inputs.at_ns - into * controller.tick_ns,
         is_boundary=state.plan.decided_step is None or step > state.plan.decided_step,
         mode=mode,
         is_flown=mode not in _NOT_FLOWN,
-        unready=unready,
+        not_ready_reason=unready,
         is_ours=vehicle is not None and not unready and not vehicle.landed and not vehicle.own_climb,
     )
 
 
-def describe_unready(vehicle: VehicleStatus | None) -> str:
+def describe_not_ready(vehicle: VehicleStatus | None) -> str:
     """Return why the vehicle does not take setpoints; empty if it does."""
     if vehicle is None:
         return "no vehicle is heard"

@@ -65,7 +65,7 @@ class Decided(msgspec.Struct, frozen=True, eq=False):
     solve: SolveStatus | None = None  # outcome of the solve; None if none was asked
     new_plan: Plan | None = None
     trouble: str = ""  # why the answer does not fly
-    is_mute: bool = False  # whether nothing may be sent in this tick
+    sends_nothing: bool = False  # whether nothing may be sent in this tick
 
     @property
     def mode(self) -> ControlMode:
@@ -130,14 +130,19 @@ def _age_plan(plan: Plan | None, supervised: Supervised) -> Plan | None:
         return None
     if supervised.replan:
         return replace(plan, captured_ns=plan.captured_ns - 1)
-    if supervised.clean_ns is None or plan.captured_ns <= supervised.clean_ns:
+    if supervised.dropped_after_ns is None or plan.captured_ns <= supervised.dropped_after_ns:
         return plan
-    return replace(plan, captured_ns=supervised.clean_ns - 1)
+    return replace(plan, captured_ns=supervised.dropped_after_ns - 1)
 
 
 def _update_biases(phase: _Phase) -> Biases:
     """Return the recent biases, without those from samples that were dropped, and with that of a new measurement."""
-    biases, context, view, clean_ns = phase.state.fallback.biases, phase.context, phase.view, phase.supervised.clean_ns
+    biases, context, view, clean_ns = (
+        phase.state.fallback.biases,
+        phase.context,
+        phase.view,
+        phase.supervised.dropped_after_ns,
+    )
     if clean_ns is not None:
         biases = tuple(one for one in biases if one[0] <= clean_ns)
     if context.mode is not ControlMode.TRACK:
@@ -149,7 +154,12 @@ def _update_biases(phase: _Phase) -> Biases:
 
 def _decide_handed_over(begun: Decided, phase: _Phase) -> Decided | None:
     """Decide for a vehicle that is handed over, stopped, silent, or takes no setpoints; None for any other."""
-    inputs, why_not, at_ns, fallback = phase.context.inputs, phase.context.unready, phase.context.at_ns, begun.fallback
+    inputs, why_not, at_ns, fallback = (
+        phase.context.inputs,
+        phase.context.not_ready_reason,
+        phase.context.at_ns,
+        begun.fallback,
+    )
     if fallback is not None and fallback.ended:
         return _fall_back(begun, fallback, phase, "handed over")
     is_stopped = inputs.stop or (fallback is not None and fallback.end is FallbackEnd.STOP)
@@ -320,7 +330,9 @@ def _wait_for_vehicle(begun: Decided, fallback: Fallback, phase: _Phase) -> Deci
         due = fallback
         if not fallback.final:
             due = Fallback(mode=fallback.mode, since_ns=fallback.since_ns, end=FallbackEnd.LAND)
-        return replace(begun, plan=None, fallback=due, consecutive_samples=consecutive, reason=reason, is_mute=True)
+        return replace(
+            begun, plan=None, fallback=due, consecutive_samples=consecutive, reason=reason, sends_nothing=True
+        )
     reason = f"{unheard}; the fallback's time runs on"
     return replace(begun, plan=None, fallback=later, consecutive_samples=consecutive, reason=reason)
 

@@ -68,7 +68,7 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
     """State of the filter; immutable."""
 
     origin_ns: int  # A boundary of the Δt grid [ns]
-    horizon_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
+    window_begin_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
     anchor: FilterState  # state of the filter at the horizon
     entries: tuple[FilterEvent, ...] = ()  # entries since then, sorted by key
 
@@ -87,7 +87,9 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
 def begin_history(kalman: Kalman, origin_ns: int, at_ns: int) -> FilterHistory:
     """Begin an empty history at `at_ns`, on the grid of boundaries origin_ns + n Δt."""
     return FilterHistory(
-        origin_ns=origin_ns, horizon_ns=_compute_horizon_ns(kalman, at_ns), anchor=FilterState(belief=None, input=None)
+        origin_ns=origin_ns,
+        window_begin_ns=_compute_window_begin_ns(kalman, at_ns),
+        anchor=FilterState(belief=None, input=None),
     )
 
 
@@ -95,19 +97,19 @@ def advance_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> Filter
     """Move the window up to `at_ns`, and keep a belief at a boundary that has come."""
     is_due = is_mark_due(kalman, history, at_ns)
     history = insert_mark(kalman, history, at_ns) if is_due else history
-    return move_horizon(kalman, history, at_ns)
+    return move_window(kalman, history, at_ns)
 
 
-def move_horizon(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
+def move_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
     """Move the window up to `at_ns`."""
-    return _trim(history, max(history.horizon_ns, _compute_horizon_ns(kalman, at_ns)))
+    return _trim(history, max(history.window_begin_ns, _compute_window_begin_ns(kalman, at_ns)))
 
 
 def is_mark_due(kalman: Kalman, history: FilterHistory, at_ns: int) -> bool:
     """Whether a boundary has come at which no belief is kept yet."""
-    horizon_ns = max(history.horizon_ns, _compute_horizon_ns(kalman, at_ns))
+    window_begin_ns = max(history.window_begin_ns, _compute_window_begin_ns(kalman, at_ns))
     mark = _find_mark(kalman, history, at_ns)
-    return mark[0] > horizon_ns and (not history.entries or history.entries[-1].key < mark)
+    return mark[0] > window_begin_ns and (not history.entries or history.entries[-1].key < mark)
 
 
 def insert_mark(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
@@ -154,7 +156,7 @@ def insert_sample(
         belief: What `predict_belief` gives at its capture time, if that is known.
     """
     key = (read_capture_ns(sample), _SAMPLE, sample.source, sample.captured_ns)
-    if key[0] <= history.horizon_ns:
+    if key[0] <= history.window_begin_ns:
         return history, EventCode.SAMPLE_TOO_OLD
     if _is_duplicate(history.entries, key):
         return history, EventCode.SAMPLE_DUPLICATE
@@ -171,7 +173,7 @@ def update_inertial(kalman: Kalman, history: FilterHistory, samples: Sequence[In
     if not readings or not kalman.n_inertial:
         return history
     at_ns = sum(one.at_ns for one in readings) // len(readings)
-    if at_ns <= history.horizon_ns:
+    if at_ns <= history.window_begin_ns:
         return history
     mean = average_vectors([one.accel_mps2 for one in readings])
     accel = np.array([mean[axis] for axis in kalman.axes])
@@ -345,7 +347,7 @@ def _find_state(history: FilterHistory, at_ns: int) -> FilterState:
     return history.anchor
 
 
-def _compute_horizon_ns(kalman: Kalman, at_ns: int) -> int:
+def _compute_window_begin_ns(kalman: Kalman, at_ns: int) -> int:
     return at_ns - round(kalman.parameters.window_s * 1e9)
 
 
@@ -365,13 +367,13 @@ def _insert(kalman: Kalman, history: FilterHistory, new: FilterEvent, belief: Be
     return replace(history, entries=(*entries[:place], *changed))
 
 
-def _trim(history: FilterHistory, horizon_ns: int) -> FilterHistory:
+def _trim(history: FilterHistory, window_begin_ns: int) -> FilterHistory:
     """Move the anchor up to the horizon."""
     past = 0
-    while past < len(history.entries) and history.entries[past].key[0] <= horizon_ns:
+    while past < len(history.entries) and history.entries[past].key[0] <= window_begin_ns:
         past += 1
     anchor = history.entries[past - 1].after if past else history.anchor
-    return replace(history, horizon_ns=horizon_ns, anchor=anchor, entries=history.entries[past:])
+    return replace(history, window_begin_ns=window_begin_ns, anchor=anchor, entries=history.entries[past:])
 
 
 def _apply_entry(

@@ -1,9 +1,9 @@
 """Phase 1 of a tick: gate its position and inertial samples, and update the filter history.
 
 1. Inputs that begin to act are noted in the filter.
-2. A sample that is invalid is refused. Each other one is compared with what is known, in the order of capture: stale
+2. A sample that is invalid is refused. Each other one is compared with what is known, in the order of capture: frozen
    sources first, then outliers (`uavctl.flight.monitors`). What is refused is as good as lost.
-3. A source that is found to be stuck: its samples since then are dropped again.
+3. A source that is found to be frozen: its samples since then are dropped again.
 4. A source has moved while nobody flew on its positions: the filter begins anew.
 5. Inertial data of the tick update the filter, as their mean.
 """
@@ -31,15 +31,15 @@ from uavctl.flight.estimator import (
     insert_mark,
     insert_sample,
     is_mark_due,
-    move_horizon,
+    move_window,
     predict_belief,
     update_inertial,
 )
 from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, read_capture_ns, read_measurement
-from uavctl.flight.monitors import outliers, stale
+from uavctl.flight.monitors import frozen, outliers
+from uavctl.flight.monitors.frozen import MovedNs, PredictedSample
 from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierObservation, OutlierTrack, Reach
-from uavctl.flight.monitors.stale import MovedNs, StaleObservation
 from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.flight.state import ControlState, InertialReading, SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleStatus
@@ -55,7 +55,7 @@ class GatedSamples(msgspec.Struct, frozen=True, eq=False):
     sources: SourceHealth
     accepted: tuple[PositionSample, ...] = ()
     refused: tuple[tuple[PositionSample, str], ...] = ()  # each with the reason (an event's code)
-    clean_ns: int | None = None  # samples captured after this have been dropped again [ns]; None if none were
+    dropped_after_ns: int | None = None  # samples captured after this have been dropped again [ns]; None if none were
     consecutive_samples: int = 0  # fresh samples in a row, up to now
     source_moved: bool = False  # whether a source has moved: no position may be believed any more
     all_absurd: bool = False  # whether all positions are further out than any can be, for so long that the same holds
@@ -115,7 +115,7 @@ def gate_samples(
         consecutive_samples: Fresh samples in a row, before.
     """
     newest_ns = history.captured_ns
-    history = move_horizon(kalman, history, inputs.at_ns)
+    history = move_window(kalman, history, inputs.at_ns)
     moved_ns = _find_moved_ns(sources.moved_ns, inputs, reach.parameters.at_rest_mps)
     sources = replace(sources, moved_ns=moved_ns)
     samples = GatedSamples(history, sources)
@@ -127,7 +127,7 @@ def gate_samples(
         )
     return replace(
         samples,
-        consecutive_samples=0 if samples.clean_ns is not None else consecutive_samples,
+        consecutive_samples=0 if samples.dropped_after_ns is not None else consecutive_samples,
         source_moved=sources.outliers is not None and sources.outliers.has_moved(reach.parameters),
         all_absurd=sources.absurd is not None and sources.absurd.has_moved(reach.parameters),
     )
@@ -152,12 +152,12 @@ def _count_fresh(
 ) -> int:
     """Count the fresh samples in a row with those of a tick at `now_ns`; the newest before it is from `newest_ns`."""
     dt_ns = kalman.propagation.dt_ns
-    late_ns = max(dt_ns, horizon * dt_ns // _FRESH_PART)
+    max_fresh_age_ns = max(dt_ns, horizon * dt_ns // _FRESH_PART)
     for at_ns in sorted(map(read_capture_ns, accepted)):
         if newest_ns is None or at_ns > newest_ns:
             boundary_ns = at_ns - 1 - (at_ns - 1 - history.origin_ns) % dt_ns  # the last one before the capture
             in_row = newest_ns is not None and boundary_ns - newest_ns < horizon * dt_ns
-            is_fresh = now_ns - at_ns <= late_ns
+            is_fresh = now_ns - at_ns <= max_fresh_age_ns
             consecutive_samples = (consecutive_samples + 1 if in_row else 1) if is_fresh else 0
             newest_ns = at_ns
     return consecutive_samples
@@ -174,19 +174,19 @@ def _gate_in_order(
     clean_ns: int | None = None
     for sample in sorted(valid, key=read_capture_ns):
         at_ns = read_capture_ns(sample)
-        belief = predict_belief(kalman, history, at_ns) if at_ns > history.horizon_ns else None
+        belief = predict_belief(kalman, history, at_ns) if at_ns > history.window_begin_ns else None
         if history.captured_ns is None:
-            first = stale.record_sample(sources.records, kalman, history, sample, np.zeros(len(kalman.axes)))
+            first = frozen.record_sample(sources.records, kalman, history, sample, np.zeros(len(kalman.axes)))
             sources = replace(sources, records=first)
         if belief is not None:  # else it is the first one, or too old
             sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, belief)
             if verdict.cause is not None:
                 code = verdict.cause.value
                 if verdict.since_ns is not None:
-                    is_stale = _captured_since(sample.source, verdict.since_ns)
-                    history, clean_ns = _drop_stale(kalman, history, is_stale, verdict.since_ns, clean_ns)
-                    refused.extend((one, code) for one in accepted if is_stale(one))
-                    accepted = [one for one in accepted if not is_stale(one)]
+                    is_repeat = _captured_since(sample.source, verdict.since_ns)
+                    history, clean_ns = _drop_repeats(kalman, history, is_repeat, verdict.since_ns, clean_ns)
+                    refused.extend((one, code) for one in accepted if is_repeat(one))
+                    accepted = [one for one in accepted if not is_repeat(one)]
                 refused.append((sample, code))
                 continue
         history, reason = insert_sample(kalman, history, sample, belief)
@@ -220,22 +220,22 @@ def _captured_since(source: str, first_ns: int) -> Callable[[PositionSample], bo
     return lambda sample: sample.source == source and read_capture_ns(sample) >= first_ns
 
 
-def _drop_stale(
+def _drop_repeats(
     kalman: Kalman,
     history: FilterHistory,
-    is_stale: Callable[[PositionSample], bool],
+    is_repeat: Callable[[PositionSample], bool],
     first_ns: int,
     clean_ns: int | None,
 ) -> tuple[FilterHistory, int | None]:
-    """Drop the samples of a stuck source since `first_ns`; return too the time after which any were dropped so far.
+    """Drop the samples of a frozen source since `first_ns`; return too the time after which any were dropped so far.
 
     The value that first came then goes too: it may be an older one, which the link had lost when it was new. It stays
     where nothing else is known.
     """
-    cleaned = drop_samples(kalman, history, is_stale)
+    cleaned = drop_samples(kalman, history, is_repeat)
     last_ns = find_newest_capture_ns(cleaned, first_ns)
     if last_ns is None:
-        cleaned = drop_samples(kalman, history, lambda one: is_stale(one) and read_capture_ns(one) > first_ns)
+        cleaned = drop_samples(kalman, history, lambda one: is_repeat(one) and read_capture_ns(one) > first_ns)
         last_ns = first_ns
     if len(cleaned.entries) == len(history.entries):
         return history, clean_ns
@@ -256,10 +256,10 @@ def _judge_sample(
     values, variances = read_measurement(kalman, sample)
     # ν = y - H z
     offset = values - belief.mean[kalman.measured_index[: len(values)]]
-    observation = StaleObservation(
+    observation = PredictedSample(
         sample, offset[:n_axes], kalman, history, _is_flying(inputs.vehicle), sources.moved_ns, reach.parameters
     )
-    records, verdict = stale.update(sources.records, observation)
+    records, verdict = frozen.update(sources.records, observation)
     sources = replace(sources, records=records)
     if not verdict.is_none:
         return sources, verdict

@@ -82,7 +82,7 @@ def _find_refusal(ordered: Ordered, command: Command, context: TickContext) -> s
         return "the vehicle has been handed over"
     if command.order is Order.LAND:
         # A fallback flies on while the vehicle is silent, and lands when it is heard again.
-        return "" if context.inputs.vehicle is None and fallback is not None else context.unready
+        return "" if context.inputs.vehicle is None and fallback is not None else context.not_ready_reason
     if fallback is not None and fallback.final:
         return "the vehicle is on its way down"
     if command.order is Order.RESUME:

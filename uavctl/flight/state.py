@@ -13,8 +13,8 @@ from uavctl.flight.link_estimate import NO_COUNTS, LinkBelief
 from uavctl.flight.mission import MissionState
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import ExternalState
+from uavctl.flight.monitors.frozen import MovedNs, SourceRecords
 from uavctl.flight.monitors.outliers import OutlierTrack
-from uavctl.flight.monitors.stale import MovedNs, SourceRecords
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Command, ControlMode, Plan, Vec3
 

@@ -14,9 +14,9 @@ This is the only table from verdicts to actions; verdicts on single samples refu
     outliers              brake, positions jumped     refused (phase 1)   -                   BRAKE while a plan flies
     sources               brake, all absurd           refused (phase 1)   -                   BRAKE while a plan flies
     prediction            brake                       -                   -                   BRAKE while a plan flies
-    stale                 distrust positions          drop (phase 1)      -                   -
+    frozen                distrust positions          drop (phase 1)      -                   -
     vehicle_velocity      distrust its velocity       -                   -                   brake by the prediction
-    unengaged             release, while carried      drop after phase 5  -                   no climb on positions
+    unengaged             release, climb or landing  drop after phase 5  -                   no climb on positions
 
 1. Inertial data are compared with the vehicle's own velocity.
 2. While we fly, the motion is watched; while others fly an armed vehicle, its positions are compared with its inertial
@@ -86,9 +86,9 @@ class Supervised(msgspec.Struct, frozen=True, eq=False):
     brake: Verdict  # verdict that brakes while a plan flies
     plan_base: Belief | None  # belief that a plan begins with, at a boundary: for the time at which inputs begin to act
     wall: Verdict  # verdict that gives up a controller of another package in place of its next plan
-    clean_ns: int | None  # capture time after which positions were dropped [ns]; None where none were
+    dropped_after_ns: int | None  # capture time after which positions were dropped [ns]; None where none were
     replan: bool  # whether a plan is made anew though no position is new
-    drop_after_ns: int | None  # capture time after which positions are dropped once the tick is over [ns]
+    drop_later_after_ns: int | None  # capture time after which positions are dropped once the tick is over [ns]
     unsafe_to_climb: str  # why a vehicle that others fly must not climb on by its positions; empty if it may
     position_inconsistent: bool  # that is because positions cannot be its own
     newest_inconsistent: bool  # the newest position is further off its inertial data than noise explains
@@ -114,9 +114,9 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
     return_ordered = _is_return_ordered(state, view, context)
     monitors, released = _watch_flight(state, view, measured, context, return_ordered)
     sources = _judge_sources(measured, context)
-    clean_ns, consecutive = samples.clean_ns, samples.consecutive_samples
+    clean_ns, consecutive = samples.dropped_after_ns, samples.consecutive_samples
     if not (released.is_none and sources.is_none):
-        clean_ns, consecutive = min(clean_ns or at_ns, monitors.clean_ns or at_ns), 0
+        clean_ns, consecutive = min(clean_ns or at_ns, monitors.consistent_ns or at_ns), 0
         view = view_filter(_drop_after(view.history, clean_ns, controller), context)
     if context.is_boundary and view.age_steps is not None and view.age_steps >= controller.horizon:
         consecutive = 0
@@ -145,9 +145,9 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
         brake=_judge_plan(state, monitors, samples.sources, view, context),
         plan_base=plan_base,
         wall=_judge_wall(state, plan_base, context),
-        clean_ns=clean_ns,
+        dropped_after_ns=clean_ns,
         replan=context.is_boundary and replans,
-        drop_after_ns=unengaged.drop_after_ns,
+        drop_later_after_ns=unengaged.drop_after_ns,
         unsafe_to_climb=unengaged.unsafe_to_climb,
         position_inconsistent=unengaged.position_inconsistent,
         newest_inconsistent=unengaged.newest_inconsistent,
@@ -195,7 +195,7 @@ def _is_return_ordered(state: ControlState, view: FilterView, context: TickConte
     asked = state.monitors.return_ordered or any(command.order is Order.ENGAGE for command in inputs.commands)
     if not asked or bounds is None:
         return False
-    if context.unready:
+    if context.not_ready_reason:
         return True
     return outside.is_outside(observe_motion(view.estimate, context, state.plan.sent_mps2), bounds)
 
@@ -329,10 +329,10 @@ def _watch_unengaged(state: ControlState, view: FilterView, measured: Measured, 
     """Watch the positions of an armed vehicle that others fly."""
     vehicle, reading = context.inputs.vehicle, measured.inertial
     is_armed = vehicle is not None and vehicle.armed
-    if context.is_flown or not (is_armed or context.carried):
+    if context.is_flown or not (is_armed or context.is_climbing_or_landing):
         return _Unengaged()
     monitors, verdict = _update_unengaged(state, measured, context)
-    jumped, inconsistent = measured.restarted and context.carried, not verdict.is_none
+    jumped, inconsistent = measured.restarted and context.is_climbing_or_landing, not verdict.is_none
     unsafe = ""
     if jumped:
         unsafe = "positions have jumped further than the vehicle can have come"
@@ -340,12 +340,12 @@ def _watch_unengaged(state: ControlState, view: FilterView, measured: Measured, 
         unsafe = verdict.text
     elif is_armed and vehicle is not None and not vehicle.landed:
         unsafe = _describe_unsafe(view, context)
-    drops = inconsistent and context.carried
+    drops = inconsistent and context.is_climbing_or_landing
     is_clipped = monitors.acceleration.clipped[-1:] == (True,)
     return _Unengaged(
         state=INITIAL if drops else monitors,
         is_watched=True,
-        drop_after_ns=(monitors.clean_ns or context.at_ns) if drops else None,
+        drop_after_ns=(monitors.consistent_ns or context.at_ns) if drops else None,
         unsafe_to_climb=unsafe,
         position_inconsistent=jumped or inconsistent,
         newest_inconsistent=bool(measured.samples.accepted) and is_clipped and reading is not None,

@@ -60,18 +60,18 @@ def make_initial_state() -> ControlState:
 
 
 def tick(
-    state: ControlState, inputs: StepInput, controller: Controller, *, carried: bool = False
+    state: ControlState, inputs: StepInput, controller: Controller, *, is_climbing_or_landing: bool = False
 ) -> tuple[ControlState, TickOutput]:
     """Run one control tick.
 
     Args:
         inputs: All that this tick may know; its number is greater than the last one's.
-        carried: Whether the vehicle is on its way up or down at our request.
+        is_climbing_or_landing: Whether the vehicle is on its way up or down at our request.
 
     Returns:
         The state for the next tick, and what to send and record.
     """
-    context = locate_on_grid(state, inputs, controller, carried)
+    context = locate_on_grid(state, inputs, controller, is_climbing_or_landing)
     measured = measure(state, context)
     supervised = supervise(state, context, measured)
     ordered = take_orders(state, context)
@@ -100,7 +100,7 @@ def _make_state(
     """Make the state for the next tick."""
     monitors = supervised.monitors
     if decided.fault != monitors.external.fault:
-        external = ExternalState(monitors.external.late, decided.fault)
+        external = ExternalState(monitors.external.overdue_answers, decided.fault)
         monitors = msgspec.structs.replace(monitors, external=external)
     return ControlState(
         estimator=EstimatorGroup(

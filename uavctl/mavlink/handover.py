@@ -51,7 +51,7 @@ _MOVING_STATES = frozenset(
 _ROUTINE_STATES = frozenset(HandoverState) - {
     HandoverState.FAILSAFE,
     HandoverState.UNCLEAR,
-    HandoverState.RELEASED,
+    HandoverState.TAKEN_OVER,
     HandoverState.LANDING,
     HandoverState.FAILED,
 }
@@ -197,7 +197,7 @@ class HandoverStateMachine:
         progress.state, setpoint_mode = TRANSITIONS[before, result.event]
         transition = None
         is_late_reason = (
-            progress.state is before is HandoverState.RELEASED and result.mode_reason is not progress.mode_reason
+            progress.state is before is HandoverState.TAKEN_OVER and result.mode_reason is not progress.mode_reason
         )
         if progress.state is not before or is_late_reason:
             previous_request = progress.request

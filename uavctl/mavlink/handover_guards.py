@@ -145,7 +145,7 @@ def _classify_takeover(progress: HandoverProgress, vehicle: VehicleStatus) -> Gu
 def explain_engage_refusal(state: HandoverState, inputs: HandoverInput) -> str:
     """Return why the external mode must not be requested again; empty if it may."""
     vehicle = inputs.vehicle
-    if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.UNCLEAR, HandoverState.FAILSAFE):
+    if state not in (HandoverState.READY, HandoverState.TAKEN_OVER, HandoverState.UNCLEAR, HandoverState.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
     if vehicle is None or is_silent(inputs.at_ns, vehicle) or vehicle.autopilot not in PROFILES:
         return "no vehicle is heard that could be flown"
@@ -165,7 +165,7 @@ def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) ->
         return f"it is not we who fly: the vehicle is in mode {mode}, and the pilot has not switched"
     if state in TAKING_OFF:
         return f"the vehicle is on its way up ({state}); order it once it is flown"
-    if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR, HandoverState.RELEASED, HandoverState.RETURNING):
+    if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR, HandoverState.TAKEN_OVER, HandoverState.RETURNING):
         return f"the vehicle has been taken over ({state}, in mode {mode}); `uavctl ctl engage` asks for it back"
     return f"the vehicle has been handed over ({state})"
 
@@ -320,7 +320,7 @@ def _guard_standby(progress: HandoverProgress, inputs: HandoverInput, vehicle: V
     )
     mode_reason = (
         determine_mode_reason(vehicle)
-        if is_reason_uncertain and progress.state is HandoverState.RELEASED
+        if is_reason_uncertain and progress.state is HandoverState.TAKEN_OVER
         else progress.mode_reason
     )
     return GuardResult(

@@ -24,7 +24,7 @@ class HandoverState(StrEnum):
     ENGAGED = "engaged"  # armed and in the external mode: setpoints
     FAILSAFE = "failsafe"  # a failsafe of the vehicle flies it on an ordered flight: nothing is sent, in bounded time
     UNCLEAR = "unclear"  # another mode for an unknown reason: nothing is sent, in bounded time
-    RELEASED = "released"  # another pilot has taken over: nothing is sent without an order
+    TAKEN_OVER = "released"  # another pilot has taken over: nothing is sent without an order
     LANDING = "landing"  # landing is requested: no setpoints any more
     SETTLING = "settling"  # the vehicle lands by itself
     DONE = "done"  # disarmed: nothing is sent any more
@@ -60,146 +60,149 @@ class SetpointMode(Enum):
 
 
 Target = tuple[HandoverState, SetpointMode]
-_W, _R, _M, _A, _C = (
-    HandoverState.WAITING,
-    HandoverState.READY,
-    HandoverState.MODE,
-    HandoverState.ARMING,
-    HandoverState.CLIMBING,
-)
-_G, _B, _E, _X, _L = (
-    HandoverState.ENGAGING,
-    HandoverState.RETURNING,
-    HandoverState.ENGAGED,
-    HandoverState.RELEASED,
-    HandoverState.LANDING,
-)
-_S, _D, _F, _V = HandoverState.SETTLING, HandoverState.DONE, HandoverState.FAILED, HandoverState.FAILSAFE
-_U = HandoverState.UNCLEAR
-_NOTHING, _NEUTRAL, _FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode.SETPOINTS
 
 # An event that is missing here keeps the state, and nothing is sent.
 _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
-    _W: {
-        HandoverEvent.REFUSED: (_F, _NOTHING),
-        HandoverEvent.LEFT: (_X, _NOTHING),  # setpoints would end PX4's failsafe
-        HandoverEvent.DISARMED: (_R, _NEUTRAL),
-        HandoverEvent.OTHER: (_R, _NEUTRAL),
-        HandoverEvent.EXTERNAL: (_E, _FLY),
+    HandoverState.WAITING: {
+        HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.LEFT: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),  # setpoints would end PX4's failsafe
+        HandoverEvent.DISARMED: (HandoverState.READY, SetpointMode.NEUTRAL),
+        HandoverEvent.OTHER: (HandoverState.READY, SetpointMode.NEUTRAL),
+        HandoverEvent.EXTERNAL: (HandoverState.ENGAGED, SetpointMode.SETPOINTS),
     },
-    _R: {
-        HandoverEvent.REFUSED: (_F, _NOTHING),
-        HandoverEvent.SILENCE: (_W, _NOTHING),
-        HandoverEvent.TAKE_OFF: (_M, _NEUTRAL),
-        HandoverEvent.ENGAGE: (_B, _NEUTRAL),
-        HandoverEvent.DISARMED: (_R, _NEUTRAL),
-        HandoverEvent.OTHER: (_R, _NEUTRAL),
-        HandoverEvent.EXTERNAL: (_E, _FLY),
+    HandoverState.READY: {
+        HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.SILENCE: (HandoverState.WAITING, SetpointMode.NOTHING),
+        HandoverEvent.TAKE_OFF: (HandoverState.MODE, SetpointMode.NEUTRAL),
+        HandoverEvent.ENGAGE: (HandoverState.RETURNING, SetpointMode.NEUTRAL),
+        HandoverEvent.DISARMED: (HandoverState.READY, SetpointMode.NEUTRAL),
+        HandoverEvent.OTHER: (HandoverState.READY, SetpointMode.NEUTRAL),
+        HandoverEvent.EXTERNAL: (HandoverState.ENGAGED, SetpointMode.SETPOINTS),
     },
-    _M: {
-        HandoverEvent.REBOOT: (_F, _NOTHING),
-        HandoverEvent.LAND: (_D, _NOTHING),  # it stands on the ground, disarmed
-        HandoverEvent.REFUSED: (_F, _NOTHING),
-        HandoverEvent.FAILSAFE: (_X, _NOTHING),  # on the ground, disarmed
-        HandoverEvent.UNCLEAR: (_U, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
-        HandoverEvent.GRANTED: (_A, _NEUTRAL),
-        HandoverEvent.PENDING: (_M, _NEUTRAL),
+    HandoverState.MODE: {
+        HandoverEvent.REBOOT: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (HandoverState.DONE, SetpointMode.NOTHING),  # it stands on the ground, disarmed
+        HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),  # on the ground, disarmed
+        HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.GRANTED: (HandoverState.ARMING, SetpointMode.NEUTRAL),
+        HandoverEvent.PENDING: (HandoverState.MODE, SetpointMode.NEUTRAL),
     },
-    _A: {
-        HandoverEvent.REBOOT: (_F, _NOTHING),
-        HandoverEvent.LAND: (_L, _NOTHING),  # arming may have been granted and starts PX4's climb
-        HandoverEvent.REFUSED: (_F, _NOTHING),
-        HandoverEvent.FAILSAFE: (_V, _NOTHING),
-        HandoverEvent.UNCLEAR: (_U, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
-        HandoverEvent.GRANTED: (_C, _NEUTRAL),
-        HandoverEvent.PENDING: (_A, _NEUTRAL),
+    HandoverState.ARMING: {
+        HandoverEvent.REBOOT: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (
+            HandoverState.LANDING,
+            SetpointMode.NOTHING,
+        ),  # arming may have been granted and starts PX4's climb
+        HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
+        HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.GRANTED: (HandoverState.CLIMBING, SetpointMode.NEUTRAL),
+        HandoverEvent.PENDING: (HandoverState.ARMING, SetpointMode.NEUTRAL),
     },
-    _C: {
-        HandoverEvent.REBOOT: (_F, _NOTHING),
-        HandoverEvent.LAND: (_L, _NOTHING),
-        HandoverEvent.UNSAFE: (_L, _NOTHING),
-        HandoverEvent.REFUSED: (_L, _NOTHING),
-        HandoverEvent.DISARMED: (_F, _NOTHING),
-        HandoverEvent.FAILSAFE: (_V, _NOTHING),
-        HandoverEvent.UNCLEAR: (_U, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
-        HandoverEvent.GRANTED: (_G, _NEUTRAL),
-        HandoverEvent.PENDING: (_C, _NEUTRAL),
+    HandoverState.CLIMBING: {
+        HandoverEvent.REBOOT: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.UNSAFE: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.REFUSED: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.DISARMED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
+        HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.GRANTED: (HandoverState.ENGAGING, SetpointMode.NEUTRAL),
+        HandoverEvent.PENDING: (HandoverState.CLIMBING, SetpointMode.NEUTRAL),
     },
-    _G: {
-        HandoverEvent.REBOOT: (_F, _NOTHING),
-        HandoverEvent.LAND: (_L, _NOTHING),
-        HandoverEvent.UNSAFE: (_L, _NOTHING),
-        HandoverEvent.REFUSED: (_L, _NOTHING),
-        HandoverEvent.DISARMED: (_F, _NOTHING),
-        HandoverEvent.FAILSAFE: (_V, _NOTHING),
-        HandoverEvent.UNCLEAR: (_U, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
-        HandoverEvent.GRANTED: (_E, _FLY),
-        HandoverEvent.PENDING: (_G, _NEUTRAL),
+    HandoverState.ENGAGING: {
+        HandoverEvent.REBOOT: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.UNSAFE: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.REFUSED: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.DISARMED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
+        HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.GRANTED: (HandoverState.ENGAGED, SetpointMode.SETPOINTS),
+        HandoverEvent.PENDING: (HandoverState.ENGAGING, SetpointMode.NEUTRAL),
     },
-    _B: {
-        HandoverEvent.REBOOT: (_X, _NOTHING),
-        HandoverEvent.LAND: (_X, _NOTHING),  # the pilot still flies
-        HandoverEvent.REFUSED: (_X, _NOTHING),
-        HandoverEvent.DISARMED: (_D, _NOTHING),
-        HandoverEvent.FAILSAFE: (_V, _NOTHING),
-        HandoverEvent.UNCLEAR: (_U, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
-        HandoverEvent.GRANTED: (_E, _FLY),
-        HandoverEvent.PENDING: (_B, _NEUTRAL),
+    HandoverState.RETURNING: {
+        HandoverEvent.REBOOT: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),  # the pilot still flies
+        HandoverEvent.REFUSED: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
+        HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.GRANTED: (HandoverState.ENGAGED, SetpointMode.SETPOINTS),
+        HandoverEvent.PENDING: (HandoverState.RETURNING, SetpointMode.NEUTRAL),
     },
-    _E: {
-        HandoverEvent.REBOOT: (_X, _NOTHING),
-        HandoverEvent.LAND: (_L, _NOTHING),
-        HandoverEvent.SILENCE: (_E, _FLY),  # the controller brakes and holds: the vehicle may still receive setpoints
-        HandoverEvent.DISARMED: (_D, _NOTHING),
-        HandoverEvent.FAILSAFE: (_V, _NOTHING),
-        HandoverEvent.UNCLEAR: (_U, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
-        HandoverEvent.EXTERNAL: (_E, _FLY),
+    HandoverState.ENGAGED: {
+        HandoverEvent.REBOOT: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.SILENCE: (
+            HandoverState.ENGAGED,
+            SetpointMode.SETPOINTS,
+        ),  # the controller brakes and holds: the vehicle may still receive setpoints
+        HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
+        HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.EXTERNAL: (HandoverState.ENGAGED, SetpointMode.SETPOINTS),
     },
-    _V: {
-        HandoverEvent.REBOOT: (_F, _NOTHING),
-        HandoverEvent.LAND: (_L, _NOTHING),
-        HandoverEvent.GRANTED: (_C, _NEUTRAL),  # the failsafe has ended, and the climb continues
-        HandoverEvent.REFUSED: (_L, _NOTHING),
-        HandoverEvent.ENGAGE: (_G, _NEUTRAL),
-        HandoverEvent.DISARMED: (_D, _NOTHING),
-        HandoverEvent.UNCLEAR: (_U, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
+    HandoverState.FAILSAFE: {
+        HandoverEvent.REBOOT: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.GRANTED: (
+            HandoverState.CLIMBING,
+            SetpointMode.NEUTRAL,
+        ),  # the failsafe has ended, and the climb continues
+        HandoverEvent.REFUSED: (HandoverState.LANDING, SetpointMode.NOTHING),
+        HandoverEvent.ENGAGE: (HandoverState.ENGAGING, SetpointMode.NEUTRAL),
+        HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
+        HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
     },
-    _U: {
-        HandoverEvent.REBOOT: (_X, _NOTHING),
-        HandoverEvent.LAND: (_L, _NOTHING),  # the operator's order
-        HandoverEvent.REFUSED: (_L, _NOTHING),  # it flies by itself, and no pilot has shown control in time
-        HandoverEvent.ENGAGE: (_B, _NEUTRAL),
-        HandoverEvent.DISARMED: (_D, _NOTHING),
-        HandoverEvent.FAILSAFE: (_V, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
+    HandoverState.UNCLEAR: {
+        HandoverEvent.REBOOT: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),  # the operator's order
+        HandoverEvent.REFUSED: (
+            HandoverState.LANDING,
+            SetpointMode.NOTHING,
+        ),  # it flies by itself, and no pilot has shown control in time
+        HandoverEvent.ENGAGE: (HandoverState.RETURNING, SetpointMode.NEUTRAL),
+        HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
     },
-    _X: {HandoverEvent.ENGAGE: (_B, _NEUTRAL), HandoverEvent.DISARMED: (_D, _NOTHING)},
-    _L: {
-        HandoverEvent.REFUSED: (_F, _NOTHING),
-        HandoverEvent.DISARMED: (_D, _NOTHING),
-        HandoverEvent.UNCLEAR: (_X, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
-        HandoverEvent.GRANTED: (_S, _NOTHING),
+    HandoverState.TAKEN_OVER: {
+        HandoverEvent.ENGAGE: (HandoverState.RETURNING, SetpointMode.NEUTRAL),
+        HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
     },
-    _S: {
-        HandoverEvent.REFUSED: (_F, _NOTHING),
-        HandoverEvent.DISARMED: (_D, _NOTHING),
-        HandoverEvent.FAILSAFE: (_L, _NOTHING),  # the landing was the failsafe's and has ended: its climb continues
-        HandoverEvent.UNCLEAR: (_X, _NOTHING),
-        HandoverEvent.OTHER: (_X, _NOTHING),
+    HandoverState.LANDING: {
+        HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
+        HandoverEvent.UNCLEAR: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.GRANTED: (HandoverState.SETTLING, SetpointMode.NOTHING),
     },
-    _D: {},
-    _F: {},
+    HandoverState.SETTLING: {
+        HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
+        HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
+        HandoverEvent.FAILSAFE: (
+            HandoverState.LANDING,
+            SetpointMode.NOTHING,
+        ),  # the landing was the failsafe's and has ended: its climb continues
+        HandoverEvent.UNCLEAR: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+        HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
+    },
+    HandoverState.DONE: {},
+    HandoverState.FAILED: {},
 }
 # States in which the end of the daemon leaves no vehicle in flight.
 NOT_LEFT_IN_FLIGHT = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
 TRANSITIONS: dict[tuple[HandoverState, HandoverEvent], Target] = {
-    (state, event): _CHANGES[state].get(event, (state, _NOTHING)) for state in HandoverState for event in HandoverEvent
+    (state, event): _CHANGES[state].get(event, (state, SetpointMode.NOTHING))
+    for state in HandoverState
+    for event in HandoverEvent
 }

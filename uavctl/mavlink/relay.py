@@ -21,7 +21,7 @@ from uavctl.frames import Quaternion, rotate_vector
 from uavctl.records import Event, PositionSample, Severity, Vec3
 
 MAX_AGE_NS = 200_000_000  # some estimators use an older position as a new one
-STUCK_AFTER = 25  # identical poses in a row
+FROZEN_POSES = 25  # identical poses in a row: 0.5 s at the usual 50 Hz; noise repeats one less than twice
 _MAX_QUEUE = 64  # poses of one tick
 SILENT_NS = 500_000_000  # without positions for longer, an estimator drifts by more than 0.1 m
 START_NS = 3_000_000_000  # start time of cameras and vehicle
@@ -31,9 +31,9 @@ REASONS = {
     HELD_BACK: "positions were found to be wrong, and are held back",
     "no attitude": "positions come without an attitude",
     "refused": "positions are not believed",
-    "stale": f"positions come later than {MAX_AGE_NS / 1e6:.0f} ms after their capture",
-    "stuck": "positions do not change any more, not by the last bit",
-    "late": "positions come that are older than those before",
+    "old": f"positions come later than {MAX_AGE_NS / 1e6:.0f} ms after their capture",
+    "frozen": "positions do not change any more, not by the last bit",
+    "out of order": "positions come that are older than those before",
     "rate": "stamps of positions do not go on",
     "no clock": "stamps of positions are from before the vehicle's start",
 }
@@ -74,7 +74,7 @@ class Relay:
         self.silent_for = ""
         self.sent = 0
         self.last_ns: int | None = None
-        self.kept = dict.fromkeys(("no attitude", "refused", "stale", "stuck", "late", "rate", "no clock"), 0)
+        self.kept = dict.fromkeys(("no attitude", "refused", "old", "frozen", "out of order", "rate", "no clock"), 0)
 
     @property
     def is_enabled(self) -> bool:
@@ -159,11 +159,11 @@ class Relay:
         self._last, self._repeat_count = (sample.position_m, attitude), self._repeat_count + 1 if is_same else 0
         newest_ns = self._newest_ns
         if at_ns - sample.captured_ns > MAX_AGE_NS:
-            return "stale"
-        if self._repeat_count >= STUCK_AFTER:
-            return "stuck"
+            return "old"
+        if self._repeat_count >= FROZEN_POSES:
+            return "frozen"
         if newest_ns is not None and sample.captured_ns <= newest_ns:
-            return "late"
+            return "out of order"
         if newest_ns is not None and sample.captured_ns - newest_ns < self._period_ns - self._period_ns // 10:
             return "rate"
         return None

@@ -32,8 +32,8 @@ def taken(state: HandoverState, after_s: float, folder: Path, *, lands: bool) ->
     """A call in which the pilot takes over, and lands or leaves the end to the operator; and when we had heard it."""
     released_ns: list[int] = []
     rig = real_rig().add_step_in(state, lambda real: real.switch_mode(STICK), after_s=after_s)
-    rig.add_step_in(HandoverState.RELEASED, lambda real: released_ns.append(real.now_ns))
-    rig.add_step_in(HandoverState.RELEASED, land if lands else interrupt, after_s=2.0)
+    rig.add_step_in(HandoverState.TAKEN_OVER, lambda real: released_ns.append(real.now_ns))
+    rig.add_step_in(HandoverState.TAKEN_OVER, land if lands else interrupt, after_s=2.0)
     result = fly_real(rig, folder, enter="\n")
     return result, released_ns[0]
 

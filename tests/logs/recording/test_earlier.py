@@ -25,7 +25,7 @@ def decode_event(code: str, text: str) -> Event:
     ("code", "text", "subject"),
     [
         ("hand-over", "arming -> climbing (GUIDED, armed)", HandoverState.CLIMBING),
-        ("hand-over", "engaged -> released (LOITER, armed): the pilot", HandoverState.RELEASED),
+        ("hand-over", "engaged -> released (LOITER, armed): the pilot", HandoverState.TAKEN_OVER),
         ("hand-over", "engaged -> waiting", HandoverState.WAITING),
         ("command-ack", "DO_SET_MODE: DENIED", "DO_SET_MODE"),
         ("order-accepted", "goto (1, 2, -1) m", Order.GOTO),

@@ -36,7 +36,7 @@ class MonitorState(msgspec.Struct, frozen=True, eq=False):
     velocity: VelocityState = VelocityState()
     outside: OutsideState = OutsideState()
     braking: BrakingState = BrakingState()
-    clean_ns: int | None = None  # capture time of the last position at which all was quiet [ns]; None before any
+    consistent_ns: int | None = None  # capture time of the last position at which all was quiet [ns]; None before any
     agreed: bool = False  # whether positions agreed with the vehicle's inertial data before the flight
 
     @property
@@ -87,7 +87,7 @@ def _update_with_position(
         motion=motion,
         acceleration=acceleration_state,
         velocity=velocity_state,
-        clean_ns=position.at_ns if position.begins or is_clean else state.clean_ns,
+        consistent_ns=position.at_ns if position.begins or is_clean else state.consistent_ns,
     )
     if response.cause is EventCode.SCATTER:  # both others say more of what is wrong
         return state, _select_first(contradiction, response)
@@ -112,4 +112,4 @@ def continue_unengaged(state: MonitorState, inertial_mps2: Vec3) -> MonitorState
         return INITIAL
     observer = Observer(at_ns=last.at_ns, mean=last.inertial, cov=last.cov, accel_mps2=np.array(inertial_mps2))
     motion = Motion(observer=observer, tick_ns=state.motion.tick_ns, sent=((last.at_ns, inertial_mps2),))
-    return MonitorState(motion=motion, clean_ns=state.clean_ns)
+    return MonitorState(motion=motion, consistent_ns=state.consistent_ns)

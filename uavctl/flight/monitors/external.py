@@ -20,15 +20,15 @@ from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, release
 from uavctl.records import Vec3
 
-LATE_IN_A_ROW = 3  # plans that took longer than a tick: one may be the computer's fault
-LONGEST_ANSWER_NS = 500_000_000  # half of the time after which a PX4 takes setpoints for gone
+MAX_OVERDUE_ANSWERS = 3  # plans that took longer than a tick: one may be the computer's fault
+MAX_ANSWER_NS = 500_000_000  # half of the time after which a PX4 takes setpoints for gone
 MARGIN_PART = 0.5  # of the distance beyond the limits that a vehicle may be at
 
 
 class ExternalState(msgspec.Struct, frozen=True):
     """State of the monitor."""
 
-    late: int = 0  # answers in a row that came too late
+    overdue_answers: int = 0  # answers in a row that came too late
     fault: str = ""  # why the controller is not asked any more; empty as long as it is
 
 
@@ -55,8 +55,8 @@ class WallObservation(msgspec.Struct, frozen=True):
 def update(state: ExternalState, observation: AnswerObservation) -> tuple[ExternalState, Verdict]:
     """Take the time of an answer: too late too often is a fault."""
     took_ns, tick_ns = observation.took_ns, observation.tick_ns
-    late = state.late + 1 if took_ns > tick_ns else 0
-    if state.fault or (late < LATE_IN_A_ROW and took_ns <= LONGEST_ANSWER_NS):
+    late = state.overdue_answers + 1 if took_ns > tick_ns else 0
+    if state.fault or (late < MAX_OVERDUE_ANSWERS and took_ns <= MAX_ANSWER_NS):
         return ExternalState(late, state.fault), NO_VERDICT
     times = f", too late {late} times in a row" if late > 1 else ""
     fault = (

@@ -12,17 +12,17 @@ from msgspec.structs import replace
 from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import absorb_samples, begin_history, note_input
 from uavctl.flight.kalman import Belief, make_kalman
-from uavctl.flight.monitors.outliers import GateParameters
-from uavctl.flight.monitors.stale import (
+from uavctl.flight.monitors.frozen import (
     MovedNs,
+    PredictedSample,
     SourceRecord,
     SourceRecords,
-    StaleObservation,
-    is_doubtful,
-    is_stuck,
+    is_frozen,
+    is_suspect,
     record_sample,
     update,
 )
+from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.records import PositionSample
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
@@ -45,15 +45,15 @@ def watched(values: list[float], source: str = "camera", watches: SourceRecords 
 
 def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_last_one() -> None:
     watch = watched([0.0, 0.5, 0.25, 0.75])["camera"]
-    assert (watch.resolution_m, watch.repeats, watch.coasting) == (0.25, 0, None)
+    assert (watch.resolution_m, watch.repeats, watch.open_loop_belief) == (0.25, 0, None)
     assert watch.noise_m == pytest.approx(0.001)
     assert (watch.changes, watch.first_ns) == (3, START_NS + 4 * TICK_NS)
     watch = watched([0.0, 0.5, 0.5, 0.5])["camera"]
     assert (watch.resolution_m, watch.repeats, watch.first_ns) == (0.5, 2, START_NS + 2 * TICK_NS)
-    assert watch.coasting is not None
-    assert watch.coasting.at_ns == watch.at_ns == START_NS + 4 * TICK_NS
+    assert watch.open_loop_belief is not None
+    assert watch.open_loop_belief.at_ns == watch.at_ns == START_NS + 4 * TICK_NS
     watch = watched([0.0, 0.5, 0.5, 0.25])["camera"]
-    assert (watch.repeats, watch.coasting) == (0, None)
+    assert (watch.repeats, watch.open_loop_belief) == (0, None)
     assert watched([0.0])["camera"].resolution_m == 0.0
     assert watched([0.0, 3.0])["camera"].resolution_m == 3.0
 
@@ -61,20 +61,20 @@ def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_
 def test_the_smallest_change_of_any_axis_shows_the_resolution() -> None:
     history = begin_history(KALMAN, START_NS, START_NS)
     records = record_sample({}, KALMAN, history, sample(START_NS), np.array([0.001]))
-    assert (records["camera"].still, records["camera"].gap_ns) == ((0, 0, 0), 0)
+    assert (records["camera"].axis_repeats, records["camera"].gap_ns) == ((0, 0, 0), 0)
     moved = sample(START_NS + TICK_NS, position_m=(0.5, 0.25, 0.0))
     assert record_sample(records, KALMAN, history, moved, np.array([0.001]))["camera"].resolution_m == 0.25
 
 
 def test_coasting_goes_by_the_inputs_alone() -> None:
     two, three = watched([0.0, 0.5, 0.5])["camera"], watched([0.0, 0.5, 0.5, 0.5])["camera"]
-    assert two.coasting is not None
-    assert three.coasting is not None
+    assert two.open_loop_belief is not None
+    assert three.open_loop_belief is not None
     a, b, e = PLANT.transition(TICK_NS * 1e-9)
-    mean = two.coasting.mean[:3]
+    mean = two.open_loop_belief.mean[:3]
     # The step's disturbance is expected to be what it was so far, until the next boundary.
-    want = a @ mean + b @ np.array([1.0]) + e @ two.coasting.mean[3:]
-    assert three.coasting.mean[:3] == pytest.approx(want, abs=1e-9)
+    want = a @ mean + b @ np.array([1.0]) + e @ two.open_loop_belief.mean[3:]
+    assert three.open_loop_belief.mean[:3] == pytest.approx(want, abs=1e-9)
 
 
 def test_sources_are_watched_apart() -> None:
@@ -113,12 +113,12 @@ def test_each_axis_is_watched_for_moves_and_repeats_of_its_own() -> None:
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
         watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
     watch = watches["camera"]
-    assert (watch.moves, watch.still) == ((4, 0, 2), (0, 5, 1))
-    assert watch.still_ns == (START_NS + 6 * TICK_NS, START_NS + TICK_NS, START_NS + 5 * TICK_NS)
+    assert (watch.axis_changes, watch.axis_repeats) == ((4, 0, 2), (0, 5, 1))
+    assert watch.axis_first_ns == (START_NS + 6 * TICK_NS, START_NS + TICK_NS, START_NS + 5 * TICK_NS)
     for n in range(20):
         one = sample(START_NS + (n + 9) * TICK_NS, position_m=(0.1 * (n % 2), 1.0, 7.0))
         watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
-    assert (watches["camera"].moves, watches["camera"].still) == ((10, 0, 2), (0, 25, 21))
+    assert (watches["camera"].axis_changes, watches["camera"].axis_repeats) == ((10, 0, 2), (0, 25, 21))
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,11 @@ def test_each_axis_is_watched_for_moves_and_repeats_of_its_own() -> None:
 def test_an_axis_that_noise_has_moved_and_that_stands_still_is_stuck(
     moves: tuple[int, ...], still: tuple[int, ...], noise_m: float, since: int | None
 ) -> None:
-    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0), 0.001, noise_m, moves=moves, still=still, still_ns=(1, 2, 3))
-    assert watch.find_still_since_ns(ALWAYS) == since
-    assert is_stuck(watch, KALMAN, sample(START_NS), PARAMETERS, ALWAYS) is (since is not None)
+    watch = SourceRecord(
+        START_NS, (0.0, 0.0, 0.0), 0.001, noise_m, axis_changes=moves, axis_repeats=still, axis_first_ns=(1, 2, 3)
+    )
+    assert watch.find_frozen_axis_ns(ALWAYS) == since
+    assert is_frozen(watch, KALMAN, sample(START_NS), PARAMETERS, ALWAYS) is (since is not None)
 
 
 ALWAYS: MovedNs = (2**62,) * 3  # it moves all the time
@@ -151,9 +153,11 @@ ALWAYS: MovedNs = (2**62,) * 3  # it moves all the time
 def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(
     moved_ns: MovedNs, since: int | None
 ) -> None:
-    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, moves=(10,) * 3, still=(5, 0, 5), still_ns=(1, 2, 3))
-    assert watch.find_still_since_ns(moved_ns) == since
-    assert is_stuck(watch, KALMAN, sample(START_NS), PARAMETERS, moved_ns) is (since is not None)
+    watch = SourceRecord(
+        START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, axis_changes=(10,) * 3, axis_repeats=(5, 0, 5), axis_first_ns=(1, 2, 3)
+    )
+    assert watch.find_frozen_axis_ns(moved_ns) == since
+    assert is_frozen(watch, KALMAN, sample(START_NS), PARAMETERS, moved_ns) is (since is not None)
 
 
 @pytest.mark.parametrize(
@@ -165,8 +169,8 @@ def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: MovedNs
     assert watch.may_rest(moved_ns) == rests
     assert replace(watch, resolution_m=1e-3).may_rest(moved_ns) == rests
     assert not replace(watch, resolution_m=4.99e-5).may_rest(moved_ns)  # noise to the last digit does not say it twice
-    assert not replace(watch, is_known_stuck=True).may_rest(moved_ns)
-    assert not replace(watch, is_doubted=True).may_rest(moved_ns)
+    assert not replace(watch, is_known_frozen=True).may_rest(moved_ns)
+    assert not replace(watch, was_suspect=True).may_rest(moved_ns)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +178,7 @@ def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: MovedNs
     [(10, 0.01, 0.01), (9, 0.01, 0.002), (9, 0.001, 0.001), (11, 0.01, 0.01), (0, 0.0, 0.0)],
 )
 def test_a_few_changes_do_not_tell_the_resolution(changes: int, resolution_m: float, grain_m: float) -> None:
-    assert SourceRecord(START_NS, (0.0, 0.0, 0.0), resolution_m, changes=changes).grain_m == grain_m
+    assert SourceRecord(START_NS, (0.0, 0.0, 0.0), resolution_m, changes=changes).limited_resolution_m == grain_m
 
 
 @pytest.mark.parametrize(
@@ -207,14 +211,16 @@ def test_what_counts_as_stuck(
         mean=np.array([2.0 + far_m, 9.0, 9.0, 9.0]),
         cov=np.diag([std_m**2, 9, 9, 9]),
     )
-    watch = SourceRecord(START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=repeats, coasting=belief)
-    assert is_stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is found
-    assert is_stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS, ALWAYS) is False
-    assert is_stuck(replace(watch, is_known_stuck=True), KALMAN, one, PARAMETERS, ALWAYS) is True
+    watch = SourceRecord(
+        START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=repeats, open_loop_belief=belief
+    )
+    assert is_frozen(watch, KALMAN, one, PARAMETERS, ALWAYS) is found
+    assert is_frozen(replace(watch, open_loop_belief=None), KALMAN, one, PARAMETERS, ALWAYS) is False
+    assert is_frozen(replace(watch, is_known_frozen=True), KALMAN, one, PARAMETERS, ALWAYS) is True
 
 
 @pytest.mark.parametrize(
-    ("noise_m", "resolution_m", "far_m", "is_doubted"),
+    ("noise_m", "resolution_m", "far_m", "suspect"),
     [
         (0.004, 0.001, 0.0, True),  # noise of four resolutions
         (0.003999, 0.001, 0.0, False),
@@ -230,25 +236,29 @@ def test_what_counts_as_stuck(
     ],
 )
 def test_when_a_value_that_came_again_is_not_believed(
-    noise_m: float, resolution_m: float, far_m: float, is_doubted: bool
+    noise_m: float, resolution_m: float, far_m: float, suspect: bool
 ) -> None:
     """However uncertain the prediction is, in the axis of the plant alone."""
     one = sample(START_NS, position_m=(2.0, 7.0, -7.0))
     for std_m in (0.0, 5.0):
         mean, cov = np.array([2.0 + far_m, 9.0, 9.0, 9.0]), np.eye(4) * std_m**2
         belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=mean, cov=cov)
-        watch = SourceRecord(START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=1, coasting=belief)
-        assert is_doubtful(watch, KALMAN, one, PARAMETERS) is is_doubted
-        assert is_doubtful(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
+        watch = SourceRecord(
+            START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=1, open_loop_belief=belief
+        )
+        assert is_suspect(watch, KALMAN, one, PARAMETERS) is suspect
+        assert is_suspect(replace(watch, open_loop_belief=None), KALMAN, one, PARAMETERS) is False
 
 
 def test_what_is_near_enough_is_so_at_the_edge_as_well() -> None:
     parameters = GateParameters(sigma=0.0, margin_m=9.0, jump_ns=0)
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
-    for north_m, is_doubted in ((2.125, False), (math.nextafter(2.125, 3.0), True)):
+    for north_m, suspect in ((2.125, False), (math.nextafter(2.125, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = SourceRecord(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
-        assert is_doubtful(watch, KALMAN, one, parameters) is is_doubted
+        watch = SourceRecord(
+            START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, open_loop_belief=belief
+        )
+        assert is_suspect(watch, KALMAN, one, parameters) is suspect
 
 
 def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
@@ -256,8 +266,10 @@ def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     for north_m, found in ((2.25, False), (math.nextafter(2.25, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = SourceRecord(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
-        assert is_stuck(watch, KALMAN, one, parameters, ALWAYS) is found
+        watch = SourceRecord(
+            START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, open_loop_belief=belief
+        )
+        assert is_frozen(watch, KALMAN, one, parameters, ALWAYS) is found
 
 
 def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> None:
@@ -289,17 +301,17 @@ def test_the_value_that_first_came_may_be_stale_where_one_was_lost_before(
     watch = SourceRecord(
         9, (0.0, 0.0, 0.0), changes=changes, repeats=repeats, first_ns=7, gap_ns=gap_ns, spacing_ns=100
     )
-    assert watch.stale_since_ns == (7 if stale else 8)
+    assert watch.repeated_since_ns == (7 if stale else 8)
 
 
 def test_the_part_of_values_that_come_again_is_learnt_of_one_repeat_or_two() -> None:
-    assert watched([0.0, 0.5, 0.7])["camera"].usual == 0.0
-    assert watched([0.0, 0.0, 0.5])["camera"].usual == 1.0
-    assert watched([0.0, 0.0, 0.0, 0.5])["camera"].usual == 1.0
-    assert watched([0.0, 0.0, 0.0, 0.0, 0.5])["camera"].usual == 0.0
-    assert watched([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])["camera"].usual == 0.0
-    assert watched([0.0, 0.0, 0.5, 0.7])["camera"].usual == 0.5
-    assert watched([0.0, 0.0, 0.5, 0.7, 0.7])["camera"].usual == 0.5
+    assert watched([0.0, 0.5, 0.7])["camera"].repeated_share == 0.0
+    assert watched([0.0, 0.0, 0.5])["camera"].repeated_share == 1.0
+    assert watched([0.0, 0.0, 0.0, 0.5])["camera"].repeated_share == 1.0
+    assert watched([0.0, 0.0, 0.0, 0.0, 0.5])["camera"].repeated_share == 0.0
+    assert watched([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])["camera"].repeated_share == 0.0
+    assert watched([0.0, 0.0, 0.5, 0.7])["camera"].repeated_share == 0.5
+    assert watched([0.0, 0.0, 0.5, 0.7, 0.7])["camera"].repeated_share == 0.5
 
 
 @pytest.mark.parametrize(
@@ -317,18 +329,18 @@ def test_the_part_of_values_that_come_again_is_learnt_of_one_repeat_or_two() -> 
     ],
 )
 def test_what_a_source_does_as_usual(usual: float, repeats: int, as_usual: bool, unlike_it: bool) -> None:
-    watch = SourceRecord(9, (0.0, 0.0, 0.0), usual=usual, repeats=repeats)
-    assert (watch.repeats_as_usual, watch.is_unusual) == (as_usual, unlike_it)
+    watch = SourceRecord(9, (0.0, 0.0, 0.0), repeated_share=usual, repeats=repeats)
+    assert (watch.repeats_regularly, watch.has_just_begun_to_repeat) == (as_usual, unlike_it)
 
 
 def test_a_source_that_says_values_twice_is_not_stuck_for_it_however_far_the_vehicle_flew() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(START_NS, START_NS, mean=np.array([3.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-    watch = SourceRecord(START_NS, one.position_m, repeats=2, usual=1.0, coasting=belief)
-    assert is_stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is False
-    assert is_doubtful(watch, KALMAN, one, PARAMETERS) is True
-    assert is_stuck(replace(watch, repeats=3), KALMAN, one, PARAMETERS, ALWAYS) is True
-    assert is_stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS, ALWAYS) is True
+    watch = SourceRecord(START_NS, one.position_m, repeats=2, repeated_share=1.0, open_loop_belief=belief)
+    assert is_frozen(watch, KALMAN, one, PARAMETERS, ALWAYS) is False
+    assert is_suspect(watch, KALMAN, one, PARAMETERS) is True
+    assert is_frozen(replace(watch, repeats=3), KALMAN, one, PARAMETERS, ALWAYS) is True
+    assert is_frozen(replace(watch, repeated_share=0.0), KALMAN, one, PARAMETERS, ALWAYS) is True
 
 
 def test_news_is_a_mean_of_which_the_first_values_are_equal_parts() -> None:
@@ -349,29 +361,29 @@ def test_the_time_between_two_values_does_not_go_by_when_it_was() -> None:
 
 
 def test_each_repeat_of_an_axis_counts() -> None:
-    assert [watched([0.5, *[1.0] * n])["camera"].still[1] for n in range(1, 6)] == [1, 2, 3, 4, 5]
+    assert [watched([0.5, *[1.0] * n])["camera"].axis_repeats[1] for n in range(1, 6)] == [1, 2, 3, 4, 5]
 
 
 def test_its_axes_do_not_stand_still_for_it() -> None:
     watch = watched([0.0, 0.0, 0.5, 0.5])["camera"]
-    assert (watch.repeats, watch.still) == (1, (0, 2, 2))
+    assert (watch.repeats, watch.axis_repeats) == (1, (0, 2, 2))
     watch = watched([0.0, 0.0, 0.5, 0.5, 0.5, 0.5])["camera"]
-    assert (watch.repeats, watch.still) == (3, (1, 3, 3))
+    assert (watch.repeats, watch.axis_repeats) == (3, (1, 3, 3))
 
 
 def test_a_value_that_was_taken_back_is_not_believed_until_another_comes() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(START_NS, START_NS, mean=np.array([2.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-    watch = SourceRecord(START_NS, one.position_m, repeats=1, coasting=belief)
-    assert is_doubtful(watch, KALMAN, one, PARAMETERS) is False
-    assert is_doubtful(replace(watch, is_doubted=True), KALMAN, one, PARAMETERS) is True
-    assert is_doubtful(replace(watch, is_doubted=True, coasting=None), KALMAN, one, PARAMETERS) is True
-    told = {"camera": replace(watch, is_doubted=True, at_ns=START_NS)}
+    watch = SourceRecord(START_NS, one.position_m, repeats=1, open_loop_belief=belief)
+    assert is_suspect(watch, KALMAN, one, PARAMETERS) is False
+    assert is_suspect(replace(watch, was_suspect=True), KALMAN, one, PARAMETERS) is True
+    assert is_suspect(replace(watch, was_suspect=True, open_loop_belief=None), KALMAN, one, PARAMETERS) is True
+    told = {"camera": replace(watch, was_suspect=True, at_ns=START_NS)}
     history = begin_history(KALMAN, START_NS, START_NS)
     again = sample(START_NS + 1, position_m=(2.0, 0.0, 0.0))
-    assert record_sample(told, KALMAN, history, again, np.zeros(1))["camera"].is_doubted
+    assert record_sample(told, KALMAN, history, again, np.zeros(1))["camera"].was_suspect
     other = sample(START_NS + 1, position_m=(2.1, 0.0, 0.0))
-    assert not record_sample(told, KALMAN, history, other, np.zeros(1))["camera"].is_doubted
+    assert not record_sample(told, KALMAN, history, other, np.zeros(1))["camera"].was_suspect
 
 
 def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_too() -> None:
@@ -383,12 +395,12 @@ def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_to
     history = note_input(KALMAN, history, one.received_ns, np.array([1.0]))
     late_ns = one.captured_ns + round(1.5e9 * KALMAN.parameters.window_s)
     history, _, _ = absorb_samples(KALMAN, history, late_ns, ())
-    assert history.horizon_ns > one.captured_ns
+    assert history.window_begin_ns > one.captured_ns
     late = sample(late_ns, position_m=(0.5, 0.0, 0.0))
     watch = record_sample(watches, KALMAN, history, late, np.zeros(1))["camera"]
-    assert watch.coasting is not None
-    assert watch.coasting.at_ns == late_ns
-    assert is_doubtful(watch, KALMAN, late, PARAMETERS)
+    assert watch.open_loop_belief is not None
+    assert watch.open_loop_belief.at_ns == late_ns
+    assert is_suspect(watch, KALMAN, late, PARAMETERS)
 
 
 def judged(
@@ -408,13 +420,13 @@ def judged(
         captured_ns = at_ns - late_ns if n == len(values) - 1 else at_ns
         one = sample(captured_ns, at_ns, position_m=(value, 0.0, 0.0))
         history, _, _ = absorb_samples(KALMAN, history, at_ns, ())
-        observation = StaleObservation(one, np.array([0.001]), KALMAN, history, is_flying, ALWAYS, PARAMETERS)
+        observation = PredictedSample(one, np.array([0.001]), KALMAN, history, is_flying, ALWAYS, PARAMETERS)
         records, verdict = update(records, observation)
         if verdict.is_none:
             history, _, _ = absorb_samples(KALMAN, history, at_ns, (one,))
         history = note_input(KALMAN, history, at_ns, np.array([accel_mps2]))
-        coasting = records["camera"].coasting
-        found.append((verdict.cause, math.nan if coasting is None else float(coasting.mean[0])))
+        open_loop_belief = records["camera"].open_loop_belief
+        found.append((verdict.cause, math.nan if open_loop_belief is None else float(open_loop_belief.mean[0])))
     return found
 
 
