@@ -28,7 +28,7 @@ LONGEST = (
     "test_report_words", "test_live", "test_build_link", "test_bench_loop", "test_campaign_positions",
     "test_report_figures", "test_flight_mission", "test_trial_position_loop", "test_natnet_flight",
     "test_config_bounds",
-    "test_bench", "test_paper_cmd", "test_rest_backoffs", "test_preview", "test_relay", "test_conditioned_flight",
+    "test_bench", "test_paper_cmd", "test_reference_backoffs", "test_preview", "test_relay", "test_conditioned_flight",
     "test_replay", "test_difference", "test_conditioned_design", "test_foreign", "test_flat",
     "test_sim_autopilot_bytes", "test_sim_fuzz", "test_synthesis", "test_campaign_world", "test_loop",
     "test_check_axes", "test_take_off", "test_replay_soak", "test_foreign_ros", "test_paper_depth",

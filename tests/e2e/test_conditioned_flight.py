@@ -10,7 +10,7 @@ import pytest
 from loopback_rig import MemorySink, lockstep, make_loop
 
 from logs.recording.replay import replay
-from uavctl.build.controller import build_conditioned, build_design, compute_rest_limits
+from uavctl.build.controller import build_conditioned, build_design, compute_reference_limits
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.lab.campaign.controllers import build_from_recipe, draw_conditions
@@ -88,7 +88,7 @@ def test_a_fence_that_closes_in_is_kept() -> None:
 @pytest.mark.slow
 def test_at_a_wall_it_settles_at_the_rest_limit_without_relaxation() -> None:
     result = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
-    rests = compute_rest_limits(build_conditioned(load_config("room")))[0]
+    rests = compute_reference_limits(build_conditioned(load_config("room")))[0]
     settled = [plan for plan in result.of(Plan) if plan.base_ns > 12e9]
     assert [plan.reference[0] for plan in settled] == pytest.approx([rests] * len(settled), abs=0.03)
     assert sum(bool(plan.gave_way) for plan in settled) <= 0.05 * len(settled)
@@ -100,7 +100,7 @@ def test_at_a_wall_it_settles_at_the_rest_limit_without_relaxation() -> None:
 def test_a_design_may_rest_nearer_to_the_walls() -> None:
     config = load_config("room")
     conditioned, design = build_conditioned(config), build_design(load_config("room-hahn-stursberg"))
-    ours, theirs = compute_rest_limits(conditioned), compute_rest_limits(design)
+    ours, theirs = compute_reference_limits(conditioned), compute_reference_limits(design)
     rows = [int(np.flatnonzero((design.state_set.c == row).all(axis=1))[0]) for row in np.eye(9)[[0, 3, 6]]]
     assert (ours[rows] > theirs[rows] + 0.1).all()
     # What it says is where a plan rests, in the middle of the other walls.
@@ -171,7 +171,7 @@ def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
     ages = draw_conditions(cell.setting, 0, 400).newest_captures[:, 12:]
     older = np.mean(np.arange(12, 12 + ages.shape[1]) - ages >= 2)
     risk = build_conditioned(cell.recipe.config).solver.risk
-    assert older == pytest.approx(1.0 - risk.weights[:2].sum(), abs=0.03)
+    assert older == pytest.approx(1.0 - risk.age_probabilities[:2].sum(), abs=0.03)
 
 
 def test_design_shows_the_risk_of_each_age(capsys: pytest.CaptureFixture[str]) -> None:

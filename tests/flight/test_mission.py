@@ -11,7 +11,7 @@ from flight_rig import make_room, small_plant
 from numpy.typing import NDArray
 
 from uavctl.build.controller import build_controller, build_design
-from uavctl.build.mission import build_mission, build_rest_limits, build_trajectory
+from uavctl.build.mission import build_mission, build_reference_limits, build_trajectory
 from uavctl.config import load_config
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError, DesignError
@@ -206,8 +206,8 @@ def test_a_mission_is_over_where_its_trajectory_ends_and_after_its_last_waypoint
 
 def test_the_end_of_a_mission_is_configured_and_needs_something_that_ends() -> None:
     config, design = room_with("mission.waypoints=[[1,1,-1]]", "mission.then=land")
-    assert build_mission(config, design, build_rest_limits(design)).land
-    assert not build_mission(load_config("room-hahn-stursberg"), design, build_rest_limits(design)).land
+    assert build_mission(config, design, build_reference_limits(design)).land
+    assert not build_mission(load_config("room-hahn-stursberg"), design, build_reference_limits(design)).land
     with pytest.raises(ConfigError, match=r"mission\.then.*no end to come after"):
         load_config("room-hahn-stursberg", ["mission.then=land"])
     with pytest.raises(ConfigError, match=r"mission\.then"):
@@ -217,7 +217,7 @@ def test_the_end_of_a_mission_is_configured_and_needs_something_that_ends() -> N
 def test_a_configured_trajectory_is_over_at_its_last_sample() -> None:
     motion = "times_s=[1.0,5.0],positions_m=[[0,0,-1],[1,0.5,-1]]"
     config, design = room_with(f"mission={{trajectory={{{motion}}},then='land'}}")
-    mission, state = build_mission(config, design, build_rest_limits(design)), MissionState(start_ns=0)
+    mission, state = build_mission(config, design, build_reference_limits(design)), MissionState(start_ns=0)
     ends = [n for n in range(40) if is_over(mission, state, n * DT_NS)]
     assert ends[0] == 25  # 5 s
 
@@ -242,7 +242,7 @@ def flown_circle() -> tuple[Config, Design]:
 
 def test_a_trajectory_is_a_motion_of_the_plant_near_the_samples(flown_circle: tuple[Config, Design]) -> None:
     config, design = flown_circle
-    states = build_trajectory(config.mission.trajectory, design, build_rest_limits(design)).states
+    states = build_trajectory(config.mission.trajectory, design, build_reference_limits(design)).states
     t = config.plant.dt_s * np.arange(61)
     wanted_m = np.column_stack([0.9 * np.cos(2 * np.pi * t / 10), 0.9 * np.sin(2 * np.pi * t / 10)])
     assert np.abs(states[:55, [0, 3]] - wanted_m[:55]).max() < 2e-3
@@ -259,7 +259,7 @@ def test_plans_along_a_trajectory_are_motions_that_leave_it_late_and_end_at_rest
 ) -> None:
     config, design = flown_circle
     plant, rest = design.plant, design.horizon - design.terminal.tau
-    trajectory = build_trajectory(config.mission.trajectory, design, build_rest_limits(design))
+    trajectory = build_trajectory(config.mission.trajectory, design, build_reference_limits(design))
     for row in (0, 7, 31):
         x = trajectory.path_states[row] + trajectory.anchors[row]
         u = trajectory.path_inputs[row]
@@ -276,7 +276,7 @@ def test_a_trajectory_towards_a_wall_turns_to_rest_before_it() -> None:
     north = 1.35 - 1.25 * np.cos(2 * np.pi * t / 8.0)  # to 2.6 m at up to 1 m/s; the limit is 3 m
     places = np.column_stack([north, 0 * t, 0 * t - 1.2]).tolist()
     config, design = room_with(f"mission.trajectory={{times_s={t.tolist()},positions_m={places}}}")
-    anchors = build_trajectory(config.mission.trajectory, design, build_rest_limits(design)).anchors
+    anchors = build_trajectory(config.mission.trajectory, design, build_reference_limits(design)).anchors
     room_m = 3.0 - design.kappa_x_terminal * np.sqrt((design.terminal.sigma_x + design.estimate_cov)[0, 0])
     assert anchors[:, 0].max() == pytest.approx(room_m)
 
@@ -285,7 +285,7 @@ def test_samples_need_not_begin_at_zero_and_may_be_joined_by_lines() -> None:
     config, design = room_with(
         "mission.trajectory={times_s=[1.0,5.0],positions_m=[[0,0,-1],[1,0.5,-1]],interpolation='linear'}"
     )
-    trajectory = build_trajectory(config.mission.trajectory, design, build_rest_limits(design))
+    trajectory = build_trajectory(config.mission.trajectory, design, build_reference_limits(design))
     assert trajectory.states[15, [0, 3, 6]] == pytest.approx([0.5, 0.25, -1.0], abs=5e-3)
     assert trajectory.states[0, [0, 3, 6]] == pytest.approx([0.0, 0.0, -1.0], abs=5e-3)
     assert len(trajectory.states) == 26 + config.smpc.horizon
@@ -295,7 +295,7 @@ def test_given_velocities_are_flown() -> None:
     config, design = room_with(
         "mission.trajectory={times_s=[0,4],positions_m=[[0,0,-1],[1,0,-1]],velocities_mps=[[0,0,0],[0,0,0]]}"
     )
-    trajectory = build_trajectory(config.mission.trajectory, design, build_rest_limits(design))
+    trajectory = build_trajectory(config.mission.trajectory, design, build_reference_limits(design))
     t = config.plant.dt_s * np.arange(21) / 4.0
     assert trajectory.states[:21, 0] == pytest.approx(3 * t**2 - 2 * t**3, abs=5e-3)
 
@@ -303,7 +303,7 @@ def test_given_velocities_are_flown() -> None:
 def test_too_fast_a_motion_is_refused_with_the_figures() -> None:
     config, design = room_with("mission.trajectory={times_s=[0,1],positions_m=[[-2,0,-1],[2,0,-1]]}")
     with pytest.raises(DesignError, match=r"[23]\.\d+ m/s beyond the upper limit of north velocity at 0\.") as raised:
-        build_mission(config, design, build_rest_limits(design))
+        build_mission(config, design, build_reference_limits(design))
     assert raised.value.key == "mission.trajectory"
 
 
@@ -317,7 +317,7 @@ def test_without_a_mission_the_target_is_held() -> None:
 
 def test_a_fence_becomes_a_row_of_the_state_set() -> None:
     config, design = room_with('fence=[{state="down",side="lower",times_s=[0,9],values=[-2.5,-1.5]}]')
-    (fence,) = build_mission(config, design, build_rest_limits(design)).fences
+    (fence,) = build_mission(config, design, build_reference_limits(design)).fences
     assert design.state_set.c[fence.row].tolist() == [0, 0, 0, 0, 0, 0, -1, 0, 0]
     assert fence.values.tolist() == [2.5, 1.5]
     assert fence.times_ns.tolist() == [0.0, 9e9]
@@ -333,7 +333,7 @@ def test_a_fence_becomes_a_row_of_the_state_set() -> None:
 def test_a_fence_that_the_design_cannot_take_is_refused(fence: str, key: str, words: str) -> None:
     config, design = room_with(f"fence=[{{{fence}}}]")
     with pytest.raises(DesignError, match=words) as raised:
-        build_mission(config, design, build_rest_limits(design))
+        build_mission(config, design, build_reference_limits(design))
     assert raised.value.key == key
 
 

@@ -15,9 +15,9 @@ from uavctl import __version__
 from uavctl.arithmetic import ARITHMETIC
 from uavctl.arrays import SECOND_NS, Array
 from uavctl.build.link import build_ages, build_delayed_link, compute_late_steps, compute_promised_probability
-from uavctl.build.mission import build_mission, build_names, build_rest_limits
+from uavctl.build.mission import build_mission, build_names, build_reference_limits
 from uavctl.build.outside import build_outside_solver, compute_code_id, compute_controller_id
-from uavctl.build.rest import check_axes, compute_rest_target
+from uavctl.build.rest import check_axes, compute_target_equilibrium
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
@@ -91,7 +91,7 @@ def build_plant(config: Config) -> Plant:
 def make_start_state(config: Config, plant: Plant) -> Array:
     """Return the state (n_x,) in which the simulator starts."""
     if not plant.axes:
-        return compute_rest_target(config, plant)[0]
+        return compute_target_equilibrium(config, plant)[0]
     state = plant.equilibrium(config.sim.start_position_m)
     for axis, index in zip(plant.axes, plant.velocity_index, strict=True):
         state[index] = config.sim.start_velocity_mps[AXES.index(axis)]
@@ -158,7 +158,7 @@ def build_problem(config: Config) -> ControlProblem:
     """
     plant, sets = build_plant(config), config.sets
     q_x, q_u = np.diag(config.cost.state), np.diag(config.cost.input)
-    target, u_target = compute_rest_target(config, plant)
+    target, u_target = compute_target_equilibrium(config, plant)
     return ControlProblem(
         plant=plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
@@ -285,9 +285,9 @@ def build_solver(design: AnyDesign, config: Config) -> Solver:
     return PrintedSolver(design)
 
 
-def compute_rest_limits(design: AnyDesign) -> Array:
+def compute_reference_limits(design: AnyDesign) -> Array:
     """Return the right sides (m_x,) of the state rows, less the back-offs of a plan at rest."""
-    return design.rest_limits if isinstance(design, ConditionedDesign) else build_rest_limits(design)
+    return design.reference_limits if isinstance(design, ConditionedDesign) else build_reference_limits(design)
 
 
 def make_design_record(design: AnyDesign) -> dict[str, object]:
@@ -389,7 +389,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
         design_id=design.design_id,
         horizon=design.horizon,
         solver=build_solver(design, config),
-        mission=build_mission(config, design, compute_rest_limits(design)),
+        mission=build_mission(config, design, compute_reference_limits(design)),
         names=build_names(design),
         link=LinkEstimateParameters(promised=_compute_min_probability(config)),
         outside=outside,

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 _ROUNDING = 1e-9
 
 
-def build_mission(config: Config, design: AnyDesign, rest_limits: Array) -> Mission:
+def build_mission(config: Config, design: AnyDesign, reference_limits: Array) -> Mission:
     """Build waypoints or a trajectory, and fences; without any, `target.position_m` is held.
 
     Args:
-        rest_limits: Right sides (m_x,) of the state rows, less the back-offs of a plan at rest.
+        reference_limits: Right sides (m_x,) of the state rows, less the back-offs of a plan at rest.
 
     Raises:
         DesignError: The plant cannot rest or move there, or a fence limits a state without a limit.
@@ -41,7 +41,7 @@ def build_mission(config: Config, design: AnyDesign, rest_limits: Array) -> Miss
         design.state_set.b,
         horizon=design.horizon,
         dt_ns=round(plant.dt_s * SECOND_NS),
-        room=_build_room(design, rest_limits),
+        room=_build_room(design, reference_limits),
     )
     if mission_config.waypoints:
         holds_s = (
@@ -56,11 +56,13 @@ def build_mission(config: Config, design: AnyDesign, rest_limits: Array) -> Miss
         mission = replace(mission, waypoints=waypoints, accept_m=mission_config.accept_m)
     return replace(
         mission,
-        trajectory=build_trajectory(mission_config.trajectory, design, rest_limits, config.plant.dead_time_s)
+        trajectory=build_trajectory(mission_config.trajectory, design, reference_limits, config.plant.dead_time_s)
         if mission_config.trajectory.times_s
         else None,
         dead_ns=round(config.plant.dead_time_s * SECOND_NS),
-        fences=tuple(_build_fence(number, fence, design, rest_limits) for number, fence in enumerate(config.fence)),
+        fences=tuple(
+            _build_fence(number, fence, design, reference_limits) for number, fence in enumerate(config.fence)
+        ),
         land=mission_config.then == "land",
         lead_ns=round(config.envelope.lead_s * SECOND_NS),
     )
@@ -80,14 +82,14 @@ def build_names(design: AnyDesign) -> Names:
 
 
 def build_trajectory(
-    trajectory_config: TrajectoryConfig, design: AnyDesign, rest_limits: Array, dead_s: float = 0.0
+    trajectory_config: TrajectoryConfig, design: AnyDesign, reference_limits: Array, dead_s: float = 0.0
 ) -> Trajectory:
     """Sample a trajectory each Δt and make the plant follow it; one horizon of rest is added at its end.
 
     Its rows begin `dead_s` after its time zero: an input that is sent then acts from there on.
 
     Args:
-        rest_limits: See `build_mission`.
+        reference_limits: See `build_mission`.
 
     Raises:
         DesignError: The motion leaves the state limits.
@@ -95,8 +97,8 @@ def build_trajectory(
     positions_m, velocities_mps = sample_trajectory(trajectory_config, design, dead_s)
     motion = follow_positions(design.plant, positions_m, velocities_mps)
     _check_limits(motion, design)
-    rest_range = compute_rest_range(design.plant, design.state_set, rest_limits)
-    return plan_along(design.plant, motion, design.horizon, design.rest_stage, *rest_range)
+    reference_range = compute_reference_range(design.plant, design.state_set, reference_limits)
+    return plan_along(design.plant, motion, design.horizon, design.arrival_stage, *reference_range)
 
 
 def sample_trajectory(
@@ -127,30 +129,30 @@ def sample_trajectory(
     return spline(within_s), spline(within_s, nu=1) * is_moving
 
 
-def build_rest_limits(design: Design) -> Array:
+def build_reference_limits(design: Design) -> Array:
     """Return the right sides (m_x,) of the state rows, less the back-offs of the design's terminal set."""
     from uavctl.smpc.hahn_stursberg.components import decompose
     from uavctl.smpc.hahn_stursberg.program import terminal_backoff_x
 
-    rest_limits = design.state_set.b.copy()
+    reference_limits = design.state_set.b.copy()
     for part in decompose(design):
-        rest_limits[part.rows_x] -= terminal_backoff_x(design, part)
-    return rest_limits
+        reference_limits[part.rows_x] -= terminal_backoff_x(design, part)
+    return reference_limits
 
 
-def _build_room(design: AnyDesign, rest_limits: Array) -> Room | None:
+def _build_room(design: AnyDesign, reference_limits: Array) -> Room | None:
     try:
-        rest_range = compute_rest_range(design.plant, design.state_set, rest_limits)
-        return make_room(design.plant, design.rest_stage, *rest_range)
+        reference_range = compute_reference_range(design.plant, design.state_set, reference_limits)
+        return make_room(design.plant, design.arrival_stage, *reference_range)
     except DesignError:
         return None
 
 
-def compute_rest_range(plant: Plant, state_set: Polytope, rest_limits: Array) -> tuple[Array, Array]:
+def compute_reference_range(plant: Plant, state_set: Polytope, reference_limits: Array) -> tuple[Array, Array]:
     """Return the least and the largest position at rest of each axis [m], by the right sides (m_x,) at rest."""
     index = plant.position_index
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
-    for c, limit in zip(state_set.c, rest_limits, strict=True):
+    for c, limit in zip(state_set.c, reference_limits, strict=True):
         (used_states,) = np.nonzero(c)
         if used_states.size == 1 and used_states[0] in index:
             axis, limit_m = index.index(int(used_states[0])), limit / c[used_states[0]]
@@ -174,7 +176,7 @@ def _check_limits(motion: PlantMotion, design: AnyDesign) -> None:
         )
 
 
-def _build_fence(number: int, fence_config: FenceConfig, design: AnyDesign, rest_limits: Array) -> Fence:
+def _build_fence(number: int, fence_config: FenceConfig, design: AnyDesign, reference_limits: Array) -> Fence:
     key, plant = f"fence[{number}]", design.plant
     axis = fence_config.state
     state = plant.position_index[plant.axes.index(axis)] if isinstance(axis, str) else axis
@@ -189,11 +191,11 @@ def _build_fence(number: int, fence_config: FenceConfig, design: AnyDesign, rest
         )
     row = rows[0]
     row_limits = abs(design.state_set.c[row, state]) * sign * np.array(fence_config.values)
-    _check_room(key, row, float(row_limits.min()), design, rest_limits)
+    _check_room(key, row, float(row_limits.min()), design, reference_limits)
     return Fence(row=row, times_ns=np.array(fence_config.times_s) * SECOND_NS, values=row_limits)
 
 
-def _check_room(key: str, row: int, min_limit: float, design: AnyDesign, rest_limits: Array) -> None:
+def _check_room(key: str, row: int, min_limit: float, design: AnyDesign, reference_limits: Array) -> None:
     """Check that a limit leaves room for plans at rest, if its state is equal at every position, as a velocity is."""
     plant = design.plant
     # Weights choose among the inputs that hold a position, not among the positions.
@@ -201,7 +203,7 @@ def _check_room(key: str, row: int, min_limit: float, design: AnyDesign, rest_li
     equilibrium_states = find_equilibria(plant.a, plant.b, *weights, np.array(plant.position_index, dtype=np.intp)).x_eq
     if np.any(design.state_set.c[row] @ equilibrium_states):
         return
-    needed = float(design.state_set.b[row] - rest_limits[row])
+    needed = float(design.state_set.b[row] - reference_limits[row])
     if min_limit < needed:
         raise DesignError(
             f"{key}.values",

@@ -228,7 +228,7 @@ def _sample_late_steps(config: Config, design: ConditionedDesign) -> NDArray[np.
     With inertial data a plan is made in every step, so its position has any age of the link. Without them a plan is
     made when a position comes, so it has the age that most positions have.
     """
-    weights = design.solver.risk.weights
+    weights = design.solver.risk.age_probabilities
     if not config.estimator.inertial_std_mps2:
         return np.full(MAX_STEPS, int(weights.argmax()))
     shares = np.cumsum(weights) / weights.sum()

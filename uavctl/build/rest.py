@@ -29,7 +29,7 @@ def check_axes(config: Config) -> None:
         )
 
 
-def compute_rest_target(config: Config, plant: Plant) -> tuple[Array, Array]:
+def compute_target_equilibrium(config: Config, plant: Plant) -> tuple[Array, Array]:
     """Return the target state (n_x,), and the input (n_u,) within its limits that holds it.
 
     The target of a plant without axes is its origin, or the middle of the limits if the origin is outside.

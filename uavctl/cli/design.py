@@ -151,13 +151,13 @@ def render_conditioned(
     title = f"Risk by the age of information, design {design.design_id} of {name}"
     ages = make_table(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
     risk, transit, problem = design.solver.risk, design.solver.transit_risk, design.solver.problem
-    remaining = 1.0 - np.cumsum(risk.weights)
+    remaining = 1.0 - np.cumsum(risk.age_probabilities)
     listed_ages = min(problem.horizon, 1 + int(np.count_nonzero(remaining > _RARE_SHARE)))
     for age in range(listed_ages):
         budgets = (f"{spread.budgets[age]:.2%}" for spread in (risk, transit))
-        ages.add_row(str(age + 1), f"{risk.weights[age]:.3g}", *budgets)
+        ages.add_row(str(age + 1), f"{risk.age_probabilities[age]:.3g}", *budgets)
     if listed_ages < problem.horizon:
-        probability = f"{risk.weights[listed_ages:].sum():.3g}"
+        probability = f"{risk.age_probabilities[listed_ages:].sum():.3g}"
         budgets = (f"up to {spread.budgets[-1]:.2%}" for spread in (risk, transit))
         ages.add_row(f"{listed_ages + 1} to {problem.horizon}", probability, *budgets)
     ages.add_row(f"> {problem.horizon}", f"{risk.older_probability:.3g}", "counts in full", "counts in full")
@@ -167,7 +167,7 @@ def render_conditioned(
     rows = (
         (row, f"{side / size:.3g}", f"{probability / size:.3g}", unit)
         for (row, unit, _), size, side, probability in zip(
-            names.rows, sizes, problem.state_set.b, design.rest_limits, strict=True
+            names.rows, sizes, problem.state_set.b, design.reference_limits, strict=True
         )
     )
     headings = ("limit", "at", "rests up to", "unit")

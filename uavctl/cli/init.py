@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from uavctl.build.controller import MIN_OUTSIDE_M, build_flight_design, compute_rest_limits
-from uavctl.build.mission import compute_rest_range
+from uavctl.build.controller import MIN_OUTSIDE_M, build_flight_design, compute_reference_limits
+from uavctl.build.mission import compute_reference_range
 from uavctl.check.parameters import compute_max_accel_mps2
 from uavctl.cli.common import print_message
 from uavctl.config import parse
@@ -154,7 +154,7 @@ def _check_fits(sizes_m: tuple[float, float, float], autopilot: str) -> None:
     length, width, height = (max(size_m, _WIDE_SIDE_M) for size_m in sizes_m)  # a room of this size always has a design
     config = parse(format_room((length, width, height), autopilot, "room"), "room").config
     design = build_flight_design(config)
-    lower_m, upper_m = compute_rest_range(design.plant, design.state_set, compute_rest_limits(design))
+    lower_m, upper_m = compute_reference_range(design.plant, design.state_set, compute_reference_limits(design))
     needed_m = np.array((length, width, height)) - (upper_m - lower_m) + MIN_FLIGHT_M
     short_sides = [
         f"a {name} of {size_m:g} m (at least {math.ceil(need_m / _ROUND_UP_M) * _ROUND_UP_M:.1f} m)"

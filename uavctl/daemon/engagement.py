@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from uavctl.build.controller import compute_rest_limits
+from uavctl.build.controller import compute_reference_limits
 from uavctl.build.mission import build_mission
 from uavctl.config import Config
 from uavctl.errors import UsageError
@@ -104,7 +104,7 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
         raise UsageError("take-off: the plant has no vertical axis, so it cannot tell how high it is; see plant.axes")
     if take_off_m is None and goal is None:
         return
-    room = build_mission(config, design, compute_rest_limits(design)).room
+    room = build_mission(config, design, compute_reference_limits(design)).room
     if room is None:
         raise UsageError("take-off, goto: this plant cannot rest wherever it is sent; see plant")
     refusal = "" if goal is None else room.refusal(goal)

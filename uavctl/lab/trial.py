@@ -18,8 +18,8 @@ from scipy.interpolate import CubicHermiteSpline
 
 from sim.simulation import World
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned, build_controller, build_plant, compute_rest_limits
-from uavctl.build.mission import build_rest_limits, compute_rest_range
+from uavctl.build.controller import build_conditioned, build_controller, build_plant, compute_reference_limits
+from uavctl.build.mission import build_reference_limits, compute_reference_range
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.mission import TrajectoryConfig
@@ -251,7 +251,7 @@ def compute_usable_share(config: Config, design: AnyDesign) -> float:
         DesignError: There is no such scheme.
     """
     return _compute_volume_share(
-        config, *compute_rest_range(design.plant, design.state_set, compute_rest_limits(design))
+        config, *compute_reference_range(design.plant, design.state_set, compute_reference_limits(design))
     )
 
 
@@ -263,12 +263,12 @@ def compute_exact_usable_share(config: Config, design: Design | None) -> float:
     """
     if design is not None:
         return _compute_volume_share(
-            config, *compute_rest_range(design.plant, design.state_set, build_rest_limits(design))
+            config, *compute_reference_range(design.plant, design.state_set, build_reference_limits(design))
         )
     n_x = build_plant(config).n_x
     conditioned = build_conditioned(config, for_flight=False, cov=np.zeros((n_x, n_x)))
     return _compute_volume_share(
-        config, *compute_rest_range(conditioned.plant, conditioned.state_set, conditioned.rest_limits)
+        config, *compute_reference_range(conditioned.plant, conditioned.state_set, conditioned.reference_limits)
     )
 
 

@@ -8,8 +8,8 @@
 
        Z_{t+1} = (A + B K_ρ) Z_t (A + B K_ρ)' + A^d N A'^d,   Z_0 = 0
 
-   Rows keep κ σ. K_ρ is the regulator for the input weight ρ R, with the least ρ whose spread at the target takes
-   `_MAX_SHARE` of the room; the full gain needs more input than there is.
+   Rows keep κ σ. K_ρ is the regulator for the input weight ρ R, with the least ρ whose covariance at the target takes
+   `_MAX_SHARE` of the margin; the full gain needs more input than there is.
 3. Governor: the regulator on the predicted mean, whose next mean keeps a margin from the state limits.
 4. LQG: the regulator on the predicted mean, without limits.
 """
@@ -117,11 +117,11 @@ class MeanQp(PacketisedPredictive):
 
     def _make_planner(self, margin: float) -> BatchMpc:
         problem = self._problem
-        spread = propagate_covariance(problem.plant, problem.horizon, self._cov)
-        return BatchMpc(problem, margin * np.array([row_deviations(problem.state_set, cov) for cov in spread]))
+        state_covs = propagate_covariance(problem.plant, problem.horizon, self._cov)
+        return BatchMpc(problem, margin * np.array([row_deviations(problem.state_set, cov) for cov in state_covs]))
 
 
-_MAX_SHARE = 0.5  # share of the room that the spread at the target may take
+_MAX_SHARE = 0.5  # share of the margin that κ σ at the target may take
 _INPUT_WEIGHTS = 2.0 ** np.arange(0, 21)
 
 
@@ -133,7 +133,7 @@ class WorstCaseDelay:
         kappa_x: κ of the state rows, see `hahn_stursberg.design.kappa`.
 
     Raises:
-        DesignError: The spread leaves no room around the target, or the plant has no regulator.
+        DesignError: The covariance leaves no margin around the target, or the plant has no regulator.
     """
 
     def __init__(self, problem: ControlProblem, delay: int, kappa_x: float, kappa_u: float) -> None:
@@ -182,27 +182,27 @@ def _backoffs(problem: ControlProblem, delay: int, kappa_x: float, kappa_u: floa
     for _ in range(delay):
         error, step = error + step, plant.a @ step @ plant.a.T
     k = _prediction_gain(problem, error, step, kappa_x, kappa_u)
-    loop, spread = plant.a + plant.b @ k, np.zeros_like(step)
+    loop, state_cov = plant.a + plant.b @ k, np.zeros_like(step)
     # κ_x (c'(S + Z_t)c)^½,  κ_u (c'K_ρ Z_t K_ρ'c)^½
     backoff_x, backoff_u = [], []
     for _ in range(problem.horizon + 1):
-        backoff_x.append(kappa_x * row_deviations(problem.state_set, error + spread))
-        backoff_u.append(kappa_u * row_deviations(problem.input_set, k @ spread @ k.T))
-        spread = loop @ spread @ loop.T + step
+        backoff_x.append(kappa_x * row_deviations(problem.state_set, error + state_cov))
+        backoff_u.append(kappa_u * row_deviations(problem.input_set, k @ state_cov @ k.T))
+        state_cov = loop @ state_cov @ loop.T + step
     return np.array(backoff_x), np.array(backoff_u[:-1])
 
 
 def _prediction_gain(problem: ControlProblem, error: Array, step: Array, kappa_x: float, kappa_u: float) -> Array:
-    """Return K_ρ; if no ρ leaves enough room, the one that leaves most."""
+    """Return K_ρ; if no ρ leaves enough margin, the one that leaves most."""
     plant, best = problem.plant, (np.inf, np.zeros((problem.plant.n_u, problem.plant.n_x)))
-    room_x, room_u = problem.state_set.margin(problem.target), problem.input_set.margin(problem.u_target)
+    margin_x, margin_u = problem.state_set.margin(problem.target), problem.input_set.margin(problem.u_target)
     for weight in _INPUT_WEIGHTS:
         k = lqr(plant, problem.q_x, weight * problem.q_u).k
         # Z = (A + B K_ρ) Z (A + B K_ρ)' + A^d N A'^d
-        spread = solve_discrete_lyapunov(plant.a + plant.b @ k, step)
+        state_cov = solve_discrete_lyapunov(plant.a + plant.b @ k, step)
         share = max(
-            _find_largest_share(kappa_x * row_deviations(problem.state_set, error + spread), room_x),
-            _find_largest_share(kappa_u * row_deviations(problem.input_set, k @ spread @ k.T), room_u),
+            _find_largest_share(kappa_x * row_deviations(problem.state_set, error + state_cov), margin_x),
+            _find_largest_share(kappa_u * row_deviations(problem.input_set, k @ state_cov @ k.T), margin_u),
         )
         if share < best[0]:
             best = (share, k)
@@ -217,9 +217,9 @@ def _prediction_gain(problem: ControlProblem, error: Array, step: Array, kappa_x
     return best[1]
 
 
-def _find_largest_share(backoff: Array, room: Array) -> float:
-    """Return the largest share of the room that a back-off takes."""
-    shares = np.divide(backoff, room, out=np.full(room.size, np.inf), where=room > 0.0)
+def _find_largest_share(backoff: Array, margin: Array) -> float:
+    """Return the largest share of the margin that a back-off takes."""
+    shares = np.divide(backoff, margin, out=np.full(margin.size, np.inf), where=margin > 0.0)
     return float(shares.max(initial=0.0))
 
 
@@ -253,18 +253,18 @@ class Governor:
         inputs = np.clip(problem.u_target + (x - problem.target) @ self._law.k.T, self._low, self._high)
         backoff = self._extend_backoffs(int(information.age.max(initial=0)) + 1)[information.age + 1]
         drift = x @ plant.a.T @ problem.state_set.c.T
-        room = problem.state_set.b - backoff - drift
-        violated = inputs @ (problem.state_set.c @ plant.b).T > room
+        margin = problem.state_set.b - backoff - drift
+        violated = inputs @ (problem.state_set.c @ plant.b).T > margin
         for i in np.flatnonzero(violated.any(axis=1) & np.isfinite(x).all(axis=1)):
             for part in self._parts:
-                part.move(inputs[i], room[i])
+                part.move(inputs[i], margin[i])
         return inputs
 
     def _extend_backoffs(self, age: int) -> Array:
         """Return the margins (…, m_x) of means that are 0, 1 … `age` steps old or more."""
         if len(self._backoffs) <= age:
-            limits, spread = self._problem.state_set, propagate_covariance(self._problem.plant, 2 * age, self._cov)
-            self._backoffs = self._margin * np.array([row_deviations(limits, cov) for cov in spread])
+            limits, state_covs = self._problem.state_set, propagate_covariance(self._problem.plant, 2 * age, self._cov)
+            self._backoffs = self._margin * np.array([row_deviations(limits, cov) for cov in state_covs])
         return self._backoffs
 
 
@@ -288,9 +288,9 @@ class _PartStep:
             np.where(soft, problem.slack_quadratic, 0.0),
         )
 
-    def move(self, inputs: Array, room: Array) -> None:
-        """Move the part's inputs in `inputs` (n_u,) until the rows keep `room` (m_x,)."""
-        sides = np.concatenate([room[self._rows], self._sides])
+    def move(self, inputs: Array, margin: Array) -> None:
+        """Move the part's inputs in `inputs` (n_u,) until the rows keep `margin` (m_x,)."""
+        sides = np.concatenate([margin[self._rows], self._sides])
         u = inputs[self._part.inputs]
         solved = self._program.solve(-2.0 * u, sides, np.full(sides.size, -np.inf))
         inputs[self._part.inputs] = np.nan if solved is None else solved[0]

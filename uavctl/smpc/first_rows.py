@@ -124,20 +124,20 @@ class FirstRows:
             np.minimum(ramp, upper[self._inputs] * self._unit, out=top)
         gain = top - slow
         gain -= self._before
-        room, used = (high - braked)[since:], None
+        margin, used = (high - braked)[since:], None
         # Bisection over the last stage, from the one where the regulator needs no more
         middle, count, infeasible = count, since, self._steps + 1
         while infeasible - count > 1:
             of_gain = self._reached[middle]
             tried = (of_gain[since:] if since else of_gain).dot(gain[:middle])
-            if np.count_nonzero(tried > room):
+            if np.count_nonzero(tried > margin):
                 infeasible = middle
             else:
                 count, used = middle, tried
             middle = (count + infeasible) // 2
         if used is None:
             used = self._reached[since][since:].dot(gain[:since])
-        nearest = since + int((room - used).argmin())
+        nearest = since + int((margin - used).argmin())
         slews[since:count] = self._hard + towards
         if self._inputs is not None:
             capped = ramp[since:count] > top[since:count]

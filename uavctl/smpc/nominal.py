@@ -134,10 +134,10 @@ def propagate_covariance(plant: Plant, steps: int, cov: Array | None = None) -> 
     """
     # P_{t+1} = A P_t A' + E W E'
     noise = plant.e @ plant.w @ plant.e.T
-    spread = [np.zeros_like(noise) if cov is None else cov]
+    covs = [np.zeros_like(noise) if cov is None else cov]
     for _ in range(steps):
-        spread.append(plant.a @ spread[-1] @ plant.a.T + noise)
-    return np.array(spread)
+        covs.append(plant.a @ covs[-1] @ plant.a.T + noise)
+    return np.array(covs)
 
 
 class BatchMpc:
@@ -154,10 +154,10 @@ class BatchMpc:
     def __init__(self, problem: ControlProblem, backoff_x: Array | None = None, backoff_u: Array | None = None) -> None:
         self._problem = problem
         law = lqr(problem.plant, problem.q_x, problem.q_u)
-        room_x = problem.state_set.margin(problem.target) - (0.0 if backoff_x is None else backoff_x)
-        room_u = problem.input_set.margin(problem.u_target) - (0.0 if backoff_u is None else backoff_u)
-        sides_x = np.broadcast_to(room_x, (problem.horizon + 1, problem.state_set.b.size))
-        sides_u = np.broadcast_to(room_u, (problem.horizon, problem.input_set.b.size))
+        margin_x = problem.state_set.margin(problem.target) - (0.0 if backoff_x is None else backoff_x)
+        margin_u = problem.input_set.margin(problem.u_target) - (0.0 if backoff_u is None else backoff_u)
+        sides_x = np.broadcast_to(margin_x, (problem.horizon + 1, problem.state_set.b.size))
+        sides_u = np.broadcast_to(margin_u, (problem.horizon, problem.input_set.b.size))
         self._parts = [_PartMpc(problem, law, part, sides_x, sides_u) for part in find_parts(problem)]
 
     def compute_plans(self, x: Array) -> Array:
@@ -171,7 +171,7 @@ class BatchMpc:
 
 
 class _PartMpc:
-    """One independent part, in deviations from the target: min |z|², X x + Z z <= room.
+    """One independent part, in deviations from the target: min |z|², X x + Z z <= margin.
 
     X and Z are `_x_rows` and `_z_rows`.
     """
@@ -184,7 +184,7 @@ class _PartMpc:
         u_rows = np.einsum("mi,tij->tmj", problem.input_set.c[np.ix_(part.rows_u, part.inputs)], u_maps)
         rows = np.concatenate([x_rows.reshape(-1, x_rows.shape[2]), u_rows.reshape(-1, u_rows.shape[2])])
         self._x_rows, self._z_rows = rows[:, :n_x], rows[:, n_x:]
-        self._room = np.concatenate([sides_x[1:, part.rows_x].ravel(), sides_u[:, part.rows_u].ravel()])
+        self._margin = np.concatenate([sides_x[1:, part.rows_x].ravel(), sides_u[:, part.rows_u].ravel()])
         self._plan_x, self._plan_z = np.split(u_maps.reshape(-1, rows.shape[1]), [n_x], axis=1)
         soft = np.arange(len(rows)) < problem.horizon * part.rows_x.size
         self._open = np.full(len(rows), -OPEN)
@@ -201,18 +201,18 @@ class _PartMpc:
     def compute_plans(self, x: Array) -> Array:
         """Return the deviations of the inputs (M, H, n_u) from states (M, n_x)."""
         plans = x @ self._plan_x.T
-        room = self._room - x @ self._x_rows.T
-        for i in np.flatnonzero(~np.all(room >= 0.0, axis=1)):
-            plans[i] += self._plan_z @ self._solve_program(room[i])
+        margin = self._margin - x @ self._x_rows.T
+        for i in np.flatnonzero(~np.all(margin >= 0.0, axis=1)):
+            plans[i] += self._plan_z @ self._solve_program(margin[i])
         # The clip removes the program's tolerance only.
         return np.clip(plans.reshape(len(x), self._steps, self.inputs.size), self._low, self._high)
 
-    def _solve_program(self, room: Array) -> Array:
+    def _solve_program(self, margin: Array) -> Array:
         """Solve for z; NaN without an optimum."""
         no_optimum = np.full(self._z_rows.shape[1], np.nan)
-        if not np.isfinite(room).all():
+        if not np.isfinite(margin).all():
             return no_optimum
-        solved = self._program.solve(np.zeros_like(no_optimum), room, self._open)
+        solved = self._program.solve(np.zeros_like(no_optimum), margin, self._open)
         return no_optimum if solved is None else solved[0]
 
 

@@ -75,7 +75,7 @@ class OutsideSolver:
     def __init__(self, name: str, problem: ControlProblem, planner: FlightPlanner) -> None:
         self._name, self._problem, self._planner = name, problem, planner
         self._gain = lqr(problem.plant, problem.q_x, problem.q_u).k
-        self._rest_input = _rest_input(problem)
+        self._rest_input = _find_equilibrium_input(problem)
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """See `Solver`."""
@@ -218,10 +218,10 @@ class SilencePlanner:
 
 def retarget(problem: ControlProblem, target: Array) -> ControlProblem:
     """Return the same problem with another target (n_x,)."""
-    return replace(problem, target=target, u_target=_rest_input(problem)(target))
+    return replace(problem, target=target, u_target=_find_equilibrium_input(problem)(target))
 
 
-def _rest_input(problem: ControlProblem) -> Callable[[Array], Array]:
+def _find_equilibrium_input(problem: ControlProblem) -> Callable[[Array], Array]:
     """Return the function from an equilibrium (n_x,) to the input (n_u,) that keeps it."""
     plant = problem.plant
     rests = find_equilibria(plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp))

@@ -43,7 +43,7 @@ class NaturalSizes:
     """Natural sizes of one component's numbers, each in its own unit; all are positive."""
 
     state: Array  # size of a state after N steps of inputs of their size (n_x,)
-    input: Array  # half of the room between an input's limits (n_u,); without limits its stationary deviation
+    input: Array  # half of the range between an input's limits (n_u,); without limits its stationary deviation
     state_std: Array  # stationary deviation of a state under the terminal law (n_x,), `state` where it is rounding
     input_std: Array  # the same of an input (n_u,)
     cost: float  # stage cost of a state and an input of their sizes
@@ -81,10 +81,10 @@ def _find_half_ranges(c: Array, b: Array, default: Array) -> Array:
     half_range = np.full(c.shape[1], np.inf)
     for row, side in zip(c, b, strict=True):
         opposite = np.flatnonzero(np.all(c == -row, axis=1))
-        room = (side + float(b[opposite].min())) / 2.0 if opposite.size else abs(side)
+        margin = (side + float(b[opposite].min())) / 2.0 if opposite.size else abs(side)
         used = row != 0.0
-        if room > 0.0:
-            half_range[used] = np.minimum(half_range[used], room / np.abs(row[used]))
+        if margin > 0.0:
+            half_range[used] = np.minimum(half_range[used], margin / np.abs(row[used]))
     return np.where(np.isfinite(half_range), half_range, default)
 
 
@@ -132,7 +132,7 @@ def find_equilibria(a: Array, b: Array, q_x: Array, q_u: Array, positions: Index
         positions: Indices of the positions among the states.
     """
     n_x = len(a)
-    basis, unit_x = _find_rest_basis(a, b)
+    basis, unit_x = _find_equilibrium_basis(a, b)
     held = _choose_held(basis, positions)
     x_eq = basis @ np.linalg.inv(basis[held])
     x_eq[np.abs(x_eq) < RANK_TOLERANCE] = 0.0  # rounding, in units of similar size
@@ -151,7 +151,7 @@ def find_equilibria(a: Array, b: Array, q_x: Array, q_u: Array, positions: Index
     return Equilibria(held, coordinates, x_eq, find_holding_inputs(b, q_u, pull))
 
 
-def _find_rest_basis(a: Array, b: Array) -> tuple[Array, Array]:
+def _find_equilibrium_basis(a: Array, b: Array) -> tuple[Array, Array]:
     """Return a basis (n_x, n_y) of {x | (I - A) x in range B}, and the units (n_x,) of its rows."""
     # L' B = 0:  the null space of L' (I - A)
     unit_x, unit_u = equilibrate(b)
@@ -185,7 +185,7 @@ def _choose_held(basis: Array, positions: Index) -> Index:
     return np.array(sorted(chosen), dtype=np.intp)
 
 
-def find_rest_input(a: Array, b: Array, q_u: Array, x: Array) -> Array:
+def find_equilibrium_input(a: Array, b: Array, q_u: Array, x: Array) -> Array:
     """Return the input (n_u,) of a plan at rest in the equilibrium `x` (n_x,): of several the cheapest."""
     return find_holding_inputs(b, q_u, (x - a @ x)[:, None])[:, 0]
 

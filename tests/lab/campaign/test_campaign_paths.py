@@ -11,7 +11,7 @@ from campaign_results import cell, runs, write
 
 from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned, build_design
-from uavctl.build.mission import build_rest_limits
+from uavctl.build.mission import build_reference_limits
 from uavctl.config import load_config
 from uavctl.lab.campaign.page import render_report
 from uavctl.lab.campaign.results import read_results, summarise
@@ -50,9 +50,9 @@ def test_without_coming_near_the_time_is_infinite_and_a_steady_distance_is_the_h
 def test_the_usable_room_lies_between_the_resting_positions() -> None:
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])
     exact = build_conditioned(config, for_flight=False, cov=np.zeros((9, 9)))
-    assert compute_exact_usable_share(config, None) == pytest.approx(share(exact.rest_limits))
+    assert compute_exact_usable_share(config, None) == pytest.approx(share(exact.reference_limits))
     design = build_design(CONFIG)
-    assert compute_exact_usable_share(CONFIG, design) == pytest.approx(share(build_rest_limits(design)))
+    assert compute_exact_usable_share(CONFIG, design) == pytest.approx(share(build_reference_limits(design)))
     assert compute_exact_usable_share(CONFIG, design) < compute_exact_usable_share(config, None) < 1.0
 
 

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from logs.recording.design_view import read_design
 from logs.recording.reader import header, read
 from logs.recording.recorder import SyncRecorder
-from uavctl.build.controller import build_conditioned, build_flight_design, compute_rest_limits, make_design_record
+from uavctl.build.controller import build_conditioned, build_flight_design, compute_reference_limits, make_design_record
 from uavctl.cli.app import run as main
 from uavctl.config import dump_config, load_config
 from uavctl.config.types import ScheduleConfig, SmpcConfig
@@ -36,7 +36,7 @@ def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("design.make_design", "design.design_record", "design.assemble_design", "exact.check_schedule"):
         monkeypatch.setattr(f"uavctl.smpc.hahn_stursberg.{name}", refuse)
     monkeypatch.setattr("uavctl.smpc.hahn_stursberg.late.add_late_designs", refuse)
-    monkeypatch.setattr("uavctl.build.controller.build_rest_limits", refuse)
+    monkeypatch.setattr("uavctl.build.controller.build_reference_limits", refuse)
 
 
 def quick(folder: Path) -> str:
@@ -120,10 +120,15 @@ def test_the_id_hashes_all_that_answers_depend_on() -> None:
 def test_the_solver_of_rest_limits_is_the_one_that_flies() -> None:
     config = load_config("room-hahn-stursberg", [SCHEME])
     design = build_conditioned(config)
-    assert compute_rest_limits(design) is design.rest_limits
-    assert msgspec.json.decode(msgspec.json.encode(make_design_record(design)))["rests"] == design.rest_limits.tolist()
+    assert compute_reference_limits(design) is design.reference_limits
+    assert (
+        msgspec.json.decode(msgspec.json.encode(make_design_record(design)))["rests"]
+        == design.reference_limits.tolist()
+    )
     exact = build_conditioned(config, for_flight=False, cov=np.zeros((9, 9)))
-    assert (exact.rest_limits >= design.rest_limits).all() and (exact.rest_limits > design.rest_limits).any()
+    assert (exact.reference_limits >= design.reference_limits).all() and (
+        exact.reference_limits > design.reference_limits
+    ).any()
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.synthesis import synthesize, terminal_factors
-from uavctl.smpc.sets import Polytope, find_rest_input
+from uavctl.smpc.sets import Polytope, find_equilibrium_input
 
 # At 2 m the spring pulls with 1, which the inputs share as u_1 + u_2 / 2 = 1. Of those the cheapest, with weights of
 # 100 and 1, is u_1 = 0.01 / 0.26, u_2 = 0.5 / 0.26; the smallest is (0.8, 0.4).
@@ -59,7 +59,7 @@ def some_rest_fits(case: DesignSpec) -> bool:
 def test_the_rest_input_is_the_cheapest() -> None:
     case = requested(FITS_CHEAPEST)
     x, (a, b) = case.plant.equilibrium(PLACE_M), (case.plant.a, case.plant.b)
-    result = find_rest_input(a, b, case.q_u, x)
+    result = find_equilibrium_input(a, b, case.q_u, x)
     assert result == pytest.approx(CHEAPEST, rel=1e-9)
     assert a @ x + b @ result == pytest.approx(x, rel=1e-9, abs=1e-12)
 

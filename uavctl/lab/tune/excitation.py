@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from uavctl.build.controller import compute_rest_limits
-from uavctl.build.mission import compute_rest_range
+from uavctl.build.controller import compute_reference_limits
+from uavctl.build.mission import compute_reference_range
 from uavctl.config import Config
 from uavctl.config.mission import FenceConfig, MissionConfig
 from uavctl.errors import UsageError
@@ -137,7 +137,7 @@ def _find_ranges(config: Config, design: AnyDesign, box: SafeBox) -> list[Waypoi
         raise UsageError(f"plant.axes = {list(plant.axes)}: a box has three axes, and so must the plant that is tuned")
     lower, upper = get_room_limits(config)
     tight_lower, tight_upper = _apply_fences(config, lower.tolist(), upper.tolist())
-    rest_lower, rest_upper = compute_rest_range(design.plant, design.state_set, compute_rest_limits(design))
+    rest_lower, rest_upper = compute_reference_range(design.plant, design.state_set, compute_reference_limits(design))
     problems, ranges = [], []
     for row, name in enumerate(plant.axes):
         axis = AXES.index(name)

@@ -1,15 +1,17 @@
-"""Back-offs: spread of the risk over ages and rows, standard deviations of the rows, and distances at rest.
+"""Back-offs: risk of each age and row, standard deviations of the rows, and back-offs of the reference.
 
-1. `spread_risk` and `spread_risk_equally` spread the allowed risk 1 - δ_x over the ages t: budgets ε̄_t with
+The margin of a row is b - c'x: what its limit leaves. The back-off β is the margin that a row must keep.
+
+1. `allocate_by_price` and `allocate_equally` give each age t a budget ε̄_t of the allowed risk 1 - δ_x, with
    Σ_t π_t ε̄_t = 1 - δ_x - P(a > H).
-2. `shift_risk` spreads the budget of an age over the rows of a plan (iterative risk allocation): rows that do not bind
-   give risk to rows that bind. Row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti.
+2. `reallocate_to_rows` gives the budget of an age to the rows of a plan (iterative risk allocation): rows that do not
+   bind give risk to rows that bind. Row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti.
 3. `Deviations` are the σ_ti of a plan in open loop:
 
        σ² = c'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c,   t = 1 … H
 
-4. `compute_rest_backoffs`: plans keep their back-offs as rows of the program. The reference decides how often a new
-   position leaves a plan that cannot keep them. It keeps the larger of two distances from a limit:
+4. `compute_reference_backoffs`: plans keep their back-offs as rows of the program. The reference decides how often a
+   new position leaves a plan that cannot keep them. It keeps the larger of two distances from a limit:
    - with the first, a plan at rest at all ages is outside no more often than allowed;
    - with the second, at most a share of new plans needs slack, by a model of their first state. After t steps without
      a position (probability q_t) the mean is at the reference, or at the back-off β_t if that is further away, and the
@@ -38,27 +40,29 @@ from uavctl.smpc.sets import find_pairs
 
 PRICE = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
 MAX_RISK = 0.5  # largest risk of a row: with more, the mean would be outside of its limit
-MIN_RISK = 1e-9  # least rest of the allowed risk, as a share of it: a smaller rest is rounding
+MIN_RISK = 1e-9  # least remainder of the allowed risk, as a share of it: a smaller one is rounding
 RARE_SHARE = 0.05  # share of the allowed risk that the oldest ages, without back-offs, may use in transit
 
 
 @dataclass(frozen=True, eq=False)
 class AgeRisk:
-    """Spread of the risk over the ages of the information of a plan."""
+    """Budget of the risk for each age of the information of a plan; entry 0 is age 1."""
 
-    weights: Array  # π_t (H,), of information t = 1 … H steps old
+    age_probabilities: Array  # π_t (H,), of information t = 1 … H steps old
     older_probability: float  # P(a > H): there is no plan then, and all of it counts as outside
     # ε̄_t (H,), growing with t, with Σ_t π_t ε̄_t = 1 - δ_x - `older_probability`, if MAX_RISK of each row allows it
     budgets: Array
 
     @property
     def shares(self) -> Array:
-        """Risk that plans spread over their rows (H,); infinite where ε̄_t is 1, because the rows are free then."""
+        """Risk that plans allocate to their rows (H,); infinite where ε̄_t is 1, because the rows are free then."""
         return np.where(self.budgets >= 1.0, np.inf, self.budgets)
 
 
-def spread_risk(link: AgeModel, deviations: Array, allowed: float, price: float = PRICE, corner: int = 1) -> AgeRisk:
-    """Spread the allowed risk so that Σ_t π_t^h β_t is least where n equal rows bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.
+def allocate_by_price(
+    link: AgeModel, deviations: Array, allowed: float, price: float = PRICE, corner: int = 1
+) -> AgeRisk:
+    """Allocate the allowed risk so that Σ_t π_t^h β_t is least where n equal rows bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.
 
     With n = 1, rare ages would get MAX_RISK and no back-off. Where two rows share MAX_RISK, their back-offs at these
     ages would be the largest of all, and plans would stay far from corners.
@@ -94,11 +98,12 @@ def spread_risk(link: AgeModel, deviations: Array, allowed: float, price: float 
     return AgeRisk(weights, older_probability, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))
 
 
-def spread_risk_equally(link: AgeModel, steps: int, allowed: float, corner: int = 1) -> AgeRisk:
-    """Spread the allowed risk equally over the ages, except the oldest and rarest: those have no back-offs.
+def allocate_equally(link: AgeModel, steps: int, allowed: float, corner: int = 1) -> AgeRisk:
+    """Allocate the allowed risk equally to the ages, except the oldest and rarest: those have no back-offs.
 
-    Where a target leaves room, no plan rests near a limit. Limits matter in transit only, for plans of young ages, so
-    the weight of an age is not its share of time. Ages without back-offs use RARE_SHARE of the risk together.
+    Where a target is far from all limits, no plan comes to rest near one. Limits matter in transit only, for plans of
+    young ages, so the weight of an age is not its share of time. Ages without back-offs use RARE_SHARE of the risk
+    together.
 
     Args:
         allowed: 1 - δ_x.
@@ -116,7 +121,7 @@ def spread_risk_equally(link: AgeModel, steps: int, allowed: float, corner: int 
 
 
 def _weigh_ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, float]:
-    """Return π_t (H,), P(a > H), and the rest of the allowed risk."""
+    """Return π_t (H,), P(a > H), and the remainder of the allowed risk."""
     # π_t = P(a >= t-1) - P(a >= t), as shares of time in the long run
     older = np.array([link.outage(age) for age in range(steps + 1)])
     weights, older_probability = older[:-1] - older[1:], float(older[-1])
@@ -133,7 +138,7 @@ def _weigh_ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, floa
 
 Flags = NDArray[np.bool_]
 
-_KEPT_SHARE = 0.5  # share of the room beyond its back-off that a row which does not bind keeps
+_KEPT_SHARE = 0.5  # share of the margin beyond its back-off that a row which does not bind keeps
 _MAX_DEVIATIONS = -float(ndtri(1e-6))  # most deviations that a row which does not bind keeps
 DISTANT_SHARE = 0.1  # share of a budget for rows that the regulator's plan is not near, before there is a plan
 _BINDING_TOLERANCE = 1e-9  # distance from its back-off at which a row binds, in standard deviations
@@ -144,22 +149,22 @@ def quantile(risk: Array) -> Array:
     return np.asarray(-ndtri(np.minimum(risk, MAX_RISK)))
 
 
-def violation_risk(room: Array, sigma: Array) -> Array:
-    """Return the probability Φ(-room / σ) that a row is violated whose mean keeps `room`; all of the same shape."""
+def violation_risk(margin: Array, sigma: Array) -> Array:
+    """Return the probability Φ(-margin / σ) that a row is violated whose mean keeps `margin`; all of the same shape."""
     if np.count_nonzero(sigma) == sigma.size:
-        return np.asarray(ndtr(room / -sigma))
+        return np.asarray(ndtr(margin / -sigma))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(sigma > 0.0, ndtr(-room / sigma), np.where(room < 0.0, 1.0, 0.0))
+        return np.where(sigma > 0.0, ndtr(-margin / sigma), np.where(margin < 0.0, 1.0, 0.0))
 
 
-def find_binding(backoff: Array, room: Array, sigma: Array) -> Flags:
+def find_binding(backoff: Array, margin: Array, sigma: Array) -> Flags:
     """Return which rows are at their back-offs or beyond."""
-    return np.asarray(room <= backoff + _BINDING_TOLERANCE * sigma)
+    return np.asarray(margin <= backoff + _BINDING_TOLERANCE * sigma)
 
 
-def shift_risk(
+def reallocate_to_rows(
     backoff: Array,
-    room: Array,
+    margin: Array,
     sigma: Array,
     budgets: Array,
     binds: Flags,
@@ -167,18 +172,18 @@ def shift_risk(
 ) -> Array:
     """Shift risk from rows that do not bind to rows that bind, in stages with binding rows; return the new back-offs.
 
-    A row that does not bind keeps half of its room, so the present plan keeps all new back-offs.
+    A row that does not bind keeps half of its margin, so the present plan keeps all new back-offs.
 
     Args:
         backoff: Present back-offs (S, m) of some stages.
-        room: Room that the present plan leaves (S, m).
+        margin: Margin of the rows of the present plan (S, m).
         sigma: Standard deviations (S, m).
         budgets: ε̄ of the stages (S,), growing; where it is infinite there are no back-offs.
         binds: Which rows bind (S, m).
         max_deviations: Most standard deviations (S, 1) that a row which does not bind keeps.
     """
-    # Not binding: β <- min(β + (room - β)/2, max(β, κ_max σ));  binding: β <- Φ⁻¹(1 - (ε̄ - Σ ε_i) / n) σ
-    kept = room - backoff
+    # Not binding: β <- min(β + (margin - β)/2, max(β, κ_max σ));  binding: β <- Φ⁻¹(1 - (ε̄ - Σ ε_i) / n) σ
+    kept = margin - backoff
     np.maximum(kept, 0.0, out=kept)
     kept *= _KEPT_SHARE
     kept += backoff
@@ -270,20 +275,20 @@ def _make_part_maps(
     for i, pair in enumerate(pairs):
         directions[[row for _, row in pair.sides]] = i
     # Σ_{t+1} = A Σ_t A' + E W E',  Σ_0 = 0
-    power, spread = np.eye(len(a)), np.zeros_like(noise)
+    power, step_cov = np.eye(len(a)), np.zeros_like(noise)
     cov_maps, constants = [], []
     for _ in range(problem.horizon):
-        power, spread = a @ power, a @ spread @ a.T + noise
+        power, step_cov = a @ power, a @ step_cov @ a.T + noise
         phi = c @ power
         cov_maps.append((phi[:, :, None] * phi[:, None, :]).reshape(len(c), states.size**2))
-        constants.append(np.einsum("mi,ij,mj->m", c, spread, c))
+        constants.append(np.einsum("mi,ij,mj->m", c, step_cov, c))
     return np.array(cov_maps), np.array(constants), directions
 
 
 SLACK_SHARE = 0.7  # share of new plans beside a limit that may need slack, as a share of 1 - δ_x
 
 
-def compute_rest_backoffs(
+def compute_reference_backoffs(
     problem: ControlProblem,
     risk: AgeRisk,
     allowed: float,
@@ -296,14 +301,14 @@ def compute_rest_backoffs(
     """Return the distances (max_shares, m) of plans at rest from rows `c` (m, n_x), for 1 … `max_shares` sharing rows.
 
     Args:
-        risk: How the risk is spread over the ages.
+        risk: Budgets of the ages.
         allowed: 1 - δ_x.
         slew: Largest change of setpoints in a step.
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states, the plant's before biases of its inputs; None: `problem.plant`.
             A new estimate of a bias changes no plan, because inputs include the bias.
     """
-    rows = _make_resting_rows(problem, risk, slew, c, cov, problem.plant if filter_plant is None else filter_plant)
+    rows = _make_reference_rows(problem, risk, slew, c, cov, problem.plant if filter_plant is None else filter_plant)
     distances = np.zeros((max_shares, len(c)))
     for share in range(1, max_shares + 1):
         for row in range(len(c)):
@@ -315,7 +320,7 @@ def compute_rest_backoffs(
 class _RestingRows:
     """Rows of plans at rest, with stages s = 1 … H of a new plan and t = 1 … L of the previous one."""
 
-    risk: AgeRisk  # spread of the risk over the ages
+    risk: AgeRisk  # budgets of the ages
     age: int  # age of most positions when they arrive [steps]
     gaps: Array  # q_t (L,)
     sigma: Array  # deviations of the rows (H, m) in the stages of a plan
@@ -324,7 +329,7 @@ class _RestingRows:
 
     def find_distance(self, row: int, share: int, allowed: float) -> float:
         """Return the distance to keep from a row that shares the risk with `share` - 1 others."""
-        weights, sigma = self.risk.weights[self.age :], self.sigma[: self.gaps.size, row]
+        weights, sigma = self.risk.age_probabilities[self.age :], self.sigma[: self.gaps.size, row]
         ages = np.minimum(self.age + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
         backoff = quantile(self.risk.shares[ages] / share) * self.sigma[:, row]
         before, jumps = backoff[: self.gaps.size, None], self.jump[:, :, row]
@@ -338,8 +343,8 @@ class _RestingRows:
 
         def slack_excess(d: float) -> float:
             # Σ_t q_t max_s Φ(-(max(d, β_t) - β_s + g_s) / σ_ts) - 0.7 (1 - δ_x) / n
-            room = np.maximum(d, before) - backoff + self.reach[:, row]
-            return float(self.gaps @ violation_risk(room, jumps).max(axis=1)) - SLACK_SHARE * allowed / share
+            margin = np.maximum(d, before) - backoff + self.reach[:, row]
+            return float(self.gaps @ violation_risk(margin, jumps).max(axis=1)) - SLACK_SHARE * allowed / share
 
         from scipy.optimize import brentq  # slow to import, needed for a design only
 
@@ -353,20 +358,20 @@ class _RestingRows:
         return distance
 
 
-def _make_resting_rows(
+def _make_reference_rows(
     problem: ControlProblem, risk: AgeRisk, slew: SlewRows, c: Array, cov: Array | None, filter_plant: Plant
 ) -> _RestingRows:
     plant, steps = problem.plant, problem.horizon
-    age = int(risk.weights.argmax())
-    spread = propagate_covariance(filter_plant, age + steps, cov)[age:, : plant.n_x, : plant.n_x]
+    age = int(risk.age_probabilities.argmax())
+    step_covs = propagate_covariance(filter_plant, age + steps, cov)[age:, : plant.n_x, : plant.n_x]
     # Share of plans that are still flown at each age, and q_t of those that end there
-    flown_share = np.minimum.accumulate(risk.weights[age:] / risk.weights[age])
+    flown_share = np.minimum.accumulate(risk.age_probabilities[age:] / risk.age_probabilities[age])
     gaps = flown_share - np.append(flown_share[1:], 0.0)
     # S_t = Σ_t - Σ_0,  var(c'A^s e) = c'A^s S_t A^s'c
-    jump_cov = spread[1 : gaps.size + 1] - spread[0]
+    jump_cov = step_covs[1 : gaps.size + 1] - step_covs[0]
     c_powers = c @ _compute_powers(plant.a, steps)  # (H+1, m, n_x)
     variance = np.einsum("smi,tij,smj->tsm", c_powers[1:], jump_cov, c_powers[1:])
-    deviations = np.sqrt(np.maximum(np.einsum("mi,tij,mj->tm", c, spread[1:], c), 0.0))
+    deviations = np.sqrt(np.maximum(np.einsum("mi,tij,mj->tm", c, step_covs[1:], c), 0.0))
     return _RestingRows(
         risk, age, gaps, deviations, _compute_reach(problem, slew, c_powers[:-1]), np.sqrt(np.maximum(variance, 0.0))
     )

@@ -9,9 +9,9 @@
    if row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti, σ_ti² = c_i'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c_i with
    the estimate's covariance P. `docs/theory.md` has statement and proof.
 2. The budget ε̄_t of an age is fixed, because plans of different ages share the risk of one moment. There are two
-   spreads of it: one for targets that leave room from all limits (transit), one for other targets and for motions,
+   allocations of it: one for targets far from all limits (transit), one for other targets and for motions,
    whose plans meet limits at any age.
-3. A plan may spread ε̄_t over its rows as it likes (iterative risk allocation): programs and shifts of risk alternate
+3. A plan may allocate ε̄_t to its rows freely (iterative risk allocation): programs and reallocations alternate
    for a few rounds.
 4. The cost is that of the regulator. With u_t = u_s + K(x_t - x_s) + c_t and the Riccati solution after stage H it is
    |z|² plus a constant, z = L'c, L L' = R + B'PB. If z = 0 keeps all limits within the budgets, it is the answer. Else
@@ -39,15 +39,15 @@ from uavctl.smpc.conditioned.backoffs import (
     AgeRisk,
     Deviations,
     Flags,
-    compute_rest_backoffs,
+    allocate_by_price,
+    allocate_equally,
+    compute_reference_backoffs,
     find_binding,
     quantile,
-    shift_risk,
-    spread_risk,
-    spread_risk_equally,
+    reallocate_to_rows,
     violation_risk,
 )
-from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestEquilibria, SlewRows
+from uavctl.smpc.conditioned.program import PartProgram, ReferenceEquilibria, RegulatedRows, SlewRows
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant, digest
@@ -67,8 +67,8 @@ MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more ris
 
 
 @dataclass(frozen=True, eq=False)
-class _Margins:
-    """Margins of the rows in each stage, for a covariance and an age."""
+class _RowBackoffs:
+    """Back-offs of the rows in each stage, for a covariance and an age."""
 
     sigma: Array  # standard deviations (H, m)
     budgets: Array  # ε̄ of the stages (H,), infinite without a back-off
@@ -77,31 +77,32 @@ class _Margins:
 
 
 @dataclass(frozen=True, eq=False)
-class _Spread:
-    """Spread of the risk over the ages, and what follows from it for each age of a position [steps]."""
+class _Allocation:
+    """Allocation of the risk to the ages, and what follows from it for each age of a position [steps]."""
 
-    risk: AgeRisk  # the spread
+    risk: AgeRisk  # the budgets
     budgets: Array  # ε̄ of the stages (H, H)
     shared: Array  # quantiles of rows that share the budgets equally (H, H, 1)
     distant: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
-    rest_distances: Array  # distance of a plan at rest from each row (n, m), by the number of rows that limit a target
+    # Distance of the reference from each row (n, m), by the number of rows that limit a target
+    reference_backoffs: Array
 
 
 @dataclass(frozen=True, eq=False)
 class _PlanResult:
-    """A plan: z of each program that was solved, the back-offs (H, m), the room (H, m) and the iterations."""
+    """A plan: z of each program that was solved, the back-offs (H, m), the margin (H, m) and the iterations."""
 
     z_of_program: Sequence[tuple[PartProgram, Array]]
     backoff: Array
-    room: Array
+    margin: Array
     iterations: int
 
 
 class ConditionedSolver:
     """Answers from one strictly convex program for each independent part; never raises on numbers.
 
-    The reference is the equilibrium nearest to the target at which a plan may rest, see `compute_rest_backoffs`. An
-    answer depends on its question alone, bit for bit. Not for concurrent use.
+    The reference is the equilibrium nearest to the target at which a plan may rest, see `compute_reference_backoffs`.
+    An answer depends on its question alone, bit for bit. Not for concurrent use.
 
     Args:
         problem: The problem; every question brings a target of its own.
@@ -145,49 +146,51 @@ class ConditionedSolver:
         ]
         self._in_order = bool((self._rows == np.arange(problem.state_set.b.size)).all())
         self._c, self._b = problem.state_set.c[self._rows], problem.state_set.b[self._rows]
-        self._rests = find_equilibria(
+        self._equilibria = find_equilibria(
             plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp)
         )
-        self._has_rest_input = bool(self._rests.u_eq.any())
-        self._rest_equilibria = [RestEquilibria(problem, self._rests, part) for part in parts]
-        placed = np.vstack([equilibria.rows for equilibria in self._rest_equilibria])
-        self._resting = np.flatnonzero(np.any(placed != 0.0, axis=1))
-        self._placed = placed[self._resting]
+        self._has_equilibrium_input = bool(self._equilibria.u_eq.any())
+        self._reference_equilibria = [ReferenceEquilibria(problem, self._equilibria, part) for part in parts]
+        placed = np.vstack([equilibria.rows for equilibria in self._reference_equilibria])
+        self._reference_rows = np.flatnonzero(np.any(placed != 0.0, axis=1))
+        self._placed = placed[self._reference_rows]
         self._box = all(np.count_nonzero(row) == 1 for row in problem.input_set.c)
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.zeros((steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
         # Rooms of all rows minus their back-offs, and the view of the state rows (H, m)
-        self._rooms = np.full(width * steps + hard + 1, OPEN)
-        self._rooms_x = self._rooms[: width * steps].reshape(steps, width)
-        self._used_room = np.zeros((steps, width))  # room of state rows that all parts use so far
+        self._margins = np.full(width * steps + hard + 1, OPEN)
+        self._margins_x = self._margins[: width * steps].reshape(steps, width)
+        self._used_margin = np.zeros((steps, width))  # margin of state rows that all parts use so far
         n_parts = len(self._parts)
 
-        def spread(risk: AgeRisk) -> _Spread:
+        def make_allocation(risk: AgeRisk) -> _Allocation:
             ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-            budgets, rest_distances = risk.shares[ages], np.zeros((n_parts, width))
-            rest_distances[:, self._resting] = compute_rest_backoffs(
-                problem, risk, allowed, self._slew, self._c[self._resting], cov, n_parts, self.filter_plant
+            budgets, reference_backoffs = risk.shares[ages], np.zeros((n_parts, width))
+            reference_backoffs[:, self._reference_rows] = compute_reference_backoffs(
+                problem, risk, allowed, self._slew, self._c[self._reference_rows], cov, n_parts, self.filter_plant
             )
             shares = budgets / max(1, width)
-            return _Spread(
+            return _Allocation(
                 risk,
                 budgets,
                 quantile(shares)[:, :, None],
                 quantile(DISTANT_SHARE * shares)[:, :, None],
-                rest_distances,
+                reference_backoffs,
             )
 
-        self._near = spread(spread_risk(link, self._find_pacing_deviations(), allowed, price, n_parts))
-        self._transit = spread(spread_risk_equally(link, steps, allowed, n_parts))
+        self._near = make_allocation(allocate_by_price(link, self._find_pacing_deviations(), allowed, price, n_parts))
+        self._transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
         oldest = self._deviations.compute(None)[max(0, counts - 1)]
-        self._far = np.maximum(self._transit.rest_distances[-1], float(quantile(np.array(allowed / n_parts))) * oldest)
-        # Without limits of a preview: bounds on a target that leaves room, and on one that needs no reference
-        self._plain_far = (self._b - self._far)[self._resting]
-        self._plain_near = (self._b - self._near.rest_distances[0])[self._resting]
-        self._cached_margins: tuple[tuple[bool, int, bytes], _Margins] | None = None
+        self._far = np.maximum(
+            self._transit.reference_backoffs[-1], float(quantile(np.array(allowed / n_parts))) * oldest
+        )
+        # Without limits of a preview: bounds on a target far from limits, and on one that needs no reference
+        self._plain_far = (self._b - self._far)[self._reference_rows]
+        self._plain_near = (self._b - self._near.reference_backoffs[0])[self._reference_rows]
+        self._cached_backoffs: tuple[tuple[bool, int, bytes], _RowBackoffs] | None = None
 
     @property
     def risk(self) -> AgeRisk:
@@ -196,17 +199,19 @@ class ConditionedSolver:
 
     @property
     def transit_risk(self) -> AgeRisk:
-        """Risk by age where the target leaves room."""
+        """Risk by age where the target is far from all limits."""
         return self._transit.risk
 
     def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
-        return self._select_spread(self._placed.dot(target[self._rests.held]), self._limits(preview), preview).risk
+        return self._select_allocation(
+            self._placed.dot(target[self._equilibria.held]), self._limits(preview), preview
+        ).risk
 
-    def rest_limits(self) -> Array:
+    def reference_limits(self) -> Array:
         """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self._near.rest_distances[-1]
+        sides[self._rows] -= self._near.reference_backoffs[-1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
@@ -214,24 +219,28 @@ class ConditionedSolver:
         if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         limits = self._limits(preview)
-        placed = self._placed.dot(target[self._rests.held])
-        margins = self._find_margins(self._select_spread(placed, limits, preview), preview)
+        placed = self._placed.dot(target[self._equilibria.held])
+        row_backoffs = self._find_row_backoffs(self._select_allocation(placed, limits, preview), preview)
         reference = self._find_reference(target, placed, limits)
-        rest_input = self._rests.u_eq @ reference[self._rests.held] if self._has_rest_input else None
+        equilibrium_input = (
+            self._equilibria.u_eq @ reference[self._equilibria.held] if self._has_equilibrium_input else None
+        )
         first = (
             None if preview.sent is None or not self._slew.axes.size else self._slew.measure_first_step(preview.sent)
         )
         dx = x - reference
         lower, upper, tightening = self._find_input_bounds(preview)
-        room_x, hard = self._regulated.compute_room(dx, limits - self._c @ reference, rest_input, first, tightening)
+        margin_x, hard = self._regulated.compute_margin(
+            dx, limits - self._c @ reference, equilibrium_input, first, tightening
+        )
         path_z: list[tuple[PartProgram, Array]] = []
         if preview.path is not None:
             path_z = [
                 (program, program.follow_path(preview.path.states, preview.path.inputs)) for program in self._parts
             ]
             for program, z in path_z:
-                program.subtract_room(z, room_x, hard)
-        result = self._spread(room_x, hard, margins)
+                program.subtract_margin(z, margin_x, hard)
+        result = self._allocate_rows(margin_x, hard, row_backoffs)
         if result is None:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         inputs, states = self._regulated.plan(dx)
@@ -242,14 +251,14 @@ class ConditionedSolver:
             relaxed += self._find_relaxed_slew(first[1])
         states += reference
         states[0] = x
-        if rest_input is not None:
-            inputs += rest_input
+        if equilibrium_input is not None:
+            inputs += equilibrium_input
         inputs, kept = self._clip(inputs, bool(result.z_of_program), lower, upper)
         backoff_x = np.zeros((len(states), self.problem.state_set.b.size))
         backoff_x[1:, slice(None) if self._in_order else self._rows] = result.backoff
         offset = 0.0
         if reference is not target:
-            offset = float(np.abs((reference - target)[self._rests.held]).sum())
+            offset = float(np.abs((reference - target)[self._equilibria.held]).sum())
         return Answer(
             seq=seq,
             status=SolveStatus.OPTIMAL if kept else SolveStatus.INACCURATE,
@@ -263,7 +272,7 @@ class ConditionedSolver:
             offset=offset,
             terminal_miss=0.0,
             cost=cost,
-            cost_lower=-np.inf,  # the spread of the risk is not convex, and each program is solved to rounding
+            cost_lower=-np.inf,  # the allocation of the risk is not convex, and each program is solved to rounding
             gap=np.inf,
             iterations=result.iterations,
             relaxed=relaxed,
@@ -276,8 +285,8 @@ class ConditionedSolver:
             limits = preview.limits[1:] if self._in_order else preview.limits[1:, self._rows]
         return limits
 
-    def _select_spread(self, placed: Array, limits: Array, preview: Preview) -> _Spread:
-        """Select the spread of a plan, by data that do not depend on the age: all ages must share one spread.
+    def _select_allocation(self, placed: Array, limits: Array, preview: Preview) -> _Allocation:
+        """Select the allocation of a plan, by data that do not depend on the age: all ages must share one.
 
         Args:
             placed: Values of the rows of resting places at the target.
@@ -286,99 +295,102 @@ class ConditionedSolver:
             return self._near
         kept = self._plain_far
         if limits is not self._b:
-            kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._resting]
+            kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._reference_rows]
         return self._transit if np.count_nonzero(placed <= kept) == kept.size else self._near
 
-    def _find_margins(self, spread: _Spread, preview: Preview) -> _Margins:
+    def _find_row_backoffs(self, allocation: _Allocation, preview: Preview) -> _RowBackoffs:
         """Return the margins of a preview; the last ones are cached, by the bits of their arguments."""
-        key = spread is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
-        if self._cached_margins is None or self._cached_margins[0] != key:
+        key = allocation is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
+        if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             sigma, age = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
-            self._cached_margins = (
+            self._cached_backoffs = (
                 key,
-                _Margins(sigma, spread.budgets[age], spread.shared[age] * sigma, spread.distant[age]),
+                _RowBackoffs(sigma, allocation.budgets[age], allocation.shared[age] * sigma, allocation.distant[age]),
             )
-        return self._cached_margins[1]
+        return self._cached_backoffs[1]
 
     def _find_reference(self, target: Array, placed: Array, limits: Array) -> Array:
         """Return the equilibrium (n_x,) nearest to the target; the rows that limit it share the budgets."""
         sides, kept = limits, self._plain_near
         if limits is not self._b:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
-            kept = (sides - self._near.rest_distances[0])[self._resting]
+            kept = (sides - self._near.reference_backoffs[0])[self._reference_rows]
         count = np.count_nonzero(placed > kept)
         if not count:
             return target
-        reference, distance = np.array(target), self._near.rest_distances[min(int(count), len(self._parts)) - 1]
-        for program, equilibria in zip(self._parts, self._rest_equilibria, strict=True):
+        reference, distance = np.array(target), self._near.reference_backoffs[min(int(count), len(self._parts)) - 1]
+        for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
 
     def _find_pacing_deviations(self) -> Array:
-        """Return the deviations (H,) for the spread over the ages: those of the position with the largest one."""
+        """Return the deviations (H,) for the allocation to the ages: those of the position with the largest one."""
         sigma, index = self._deviations.compute(None), list(self.problem.plant.position_index)
         rows = np.any(self._c[:, index] != 0.0, axis=1)
         limited = sigma[:, rows] if rows.any() else sigma
         return np.asarray(limited[:, limited[-1].argmax()] if limited.size else np.zeros(len(sigma)))
 
-    def _spread(self, room: Array, hard: Array, margins: _Margins) -> _PlanResult | None:
-        """Plan all parts, and spread the budgets over the rows of all of them in a few rounds.
+    def _allocate_rows(self, margin: Array, hard: Array, row_backoffs: _RowBackoffs) -> _PlanResult | None:
+        """Plan all parts, and allocate the budgets to the rows of all of them in a few rounds.
 
         1. If the regulator's plan (z = 0) keeps all limits within the budgets, it is the result.
-        2. Else the first back-offs follow from it: a row without room for an equal share in any stage counts as binding
-           in all stages; the back-offs of the others are at most those for DISTANT_SHARE of an equal share.
+        2. Else the first back-offs follow from it: a row whose margin in any stage is less than an equal
+           share needs counts as binding in all stages; the back-offs of the others are at most those for DISTANT_SHARE
+           of an equal share.
         3. Each round solves the programs of parts with violated or binding rows, then shifts risk from rows that do not
            bind to those that do. The plan of a round keeps the back-offs of the next, so no round raises the cost.
 
         Args:
-            room: Room of the state rows for z = 0 (H, m).
+            margin: Margin of the state rows for z = 0 (H, m).
             hard: Room of the hard rows for z = 0.
         """
-        backoff, sigma, budgets = margins.backoff, margins.sigma, margins.budgets
-        violated_x, violated = room < backoff, hard < 0.0
+        backoff, sigma, budgets = row_backoffs.backoff, row_backoffs.sigma, row_backoffs.budgets
+        violated_x, violated = margin < backoff, hard < 0.0
         if not np.count_nonzero(violated):
             if not np.count_nonzero(violated_x):
-                return _PlanResult((), backoff, room, 0)
+                return _PlanResult((), backoff, margin, 0)
             stages = np.flatnonzero(violated_x.any(axis=1))
-            risk = violation_risk(room[stages], sigma[stages])
+            risk = violation_risk(margin[stages], sigma[stages])
             if risk.max() <= MAX_RISK and (risk.sum(axis=1) <= budgets[stages]).all():
-                return _PlanResult((), np.minimum(backoff, np.maximum(room, 0.0)), room, 0)
+                return _PlanResult((), np.minimum(backoff, np.maximum(margin, 0.0)), margin, 0)
         near = np.logical_or.reduce(violated_x, axis=0)
         if np.count_nonzero(near):
-            backoff = shift_risk(backoff, room, sigma, budgets, violated_x | near, margins.distant)
-            violated_x = room < backoff
+            backoff = reallocate_to_rows(backoff, margin, sigma, budgets, violated_x | near, row_backoffs.distant)
+            violated_x = margin < backoff
         programs = [
             program
             for program in self._parts
             if np.count_nonzero(violated[program.hard]) or np.count_nonzero(violated_x[:, program.columns])
         ]
-        self._rooms[room.size : -1] = hard
-        self._used_room.fill(0.0)
+        self._margins[margin.size : -1] = hard
+        self._used_margin.fill(0.0)
         z_of_program: dict[PartProgram, Array] = {}
-        result, room_left = None, room
+        result, margin_left = None, margin
         iterations = 0
         for round_number in range(MAX_ROUNDS):
             if round_number:
-                if round_number >= ROUNDS and (backoff - room_left).max() <= KEPT_TOLERANCE:
+                if round_number >= ROUNDS and (backoff - margin_left).max() <= KEPT_TOLERANCE:
                     break
-                binds = find_binding(backoff, room_left, sigma)
+                binds = find_binding(backoff, margin_left, sigma)
                 programs = [program for program in programs if np.count_nonzero(binds[:, program.columns])]
                 if not programs or iterations > MAX_SHIFT_ITERATIONS:
                     break
                 span = _span_stages(binds)
                 backoff = backoff.copy()
-                backoff[span] = shift_risk(backoff[span], room_left[span], sigma[span], budgets[span], binds[span])
-            np.subtract(room, backoff, out=self._rooms_x)
+                backoff[span] = reallocate_to_rows(
+                    backoff[span], margin_left[span], sigma[span], budgets[span], binds[span]
+                )
+            np.subtract(margin, backoff, out=self._margins_x)
             z_of_program = dict(z_of_program)
             for program in programs:
-                z = program.solve(self._rooms, reuse_rows=round_number > 0)
+                z = program.solve(self._margins, reuse_rows=round_number > 0)
                 iterations += program.iterations
                 if z is None:
                     return result
                 z_of_program[program] = z
-                program.write_used_room(z, self._used_room)
-            room_left = room - self._used_room
-            result = _PlanResult(tuple(z_of_program.items()), backoff, room_left, iterations)
+                program.write_used_margin(z, self._used_margin)
+            margin_left = margin - self._used_margin
+            result = _PlanResult(tuple(z_of_program.items()), backoff, margin_left, iterations)
         return result
 
     def _compute_cost(
@@ -395,7 +407,7 @@ class ConditionedSolver:
             cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
         if not result.z_of_program:
             return float(cost), 0.0, ()
-        excess = np.maximum(result.backoff - result.room, 0.0)
+        excess = np.maximum(result.backoff - result.margin, 0.0)
         slack = float(excess.sum())
         if slack == 0.0:
             return float(cost), 0.0, ()
@@ -478,15 +490,15 @@ class ConditionedDesign:
     """Design for flights with risk conditioned on the age: solver, hash, and limits of resting plans."""
 
     solver: ConditionedSolver  # the solver
-    # Covariance (n, n) of the estimate's error after a position, used in `rest_limits`; with biases of the inputs
+    # Covariance (n, n) of the estimate's error after a position, used in `reference_limits`; with biases of the inputs
     # behind the states where the filter estimates them
     estimate_cov: Array
     design_id: str  # hash of all that its answers depend on, without the target, which is part of each question
     # Right sides (m_x,) of the state rows minus the distance of a plan at rest; derived
-    rest_limits: Array = field(init=False, repr=False)
+    reference_limits: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rest_limits", self.solver.rest_limits())
+        object.__setattr__(self, "reference_limits", self.solver.reference_limits())
 
     @property
     def plant(self) -> Plant:
@@ -509,7 +521,7 @@ class ConditionedDesign:
         return self.solver.problem.horizon
 
     @property
-    def rest_stage(self) -> int:
+    def arrival_stage(self) -> int:
         """Stage from which a plan along a motion rests [steps]."""
         return max(1, round(_SETTLED * self.horizon))
 
@@ -538,11 +550,11 @@ def conditioned_record(design: ConditionedDesign) -> dict[str, object]:
         "velocity_index": list(plant.velocity_index),
         "accel_per_input": plant.accel_per_input.tolist(),
         "target": design.target.tolist(),
-        "weights": risk.weights.tolist(),
+        "weights": risk.age_probabilities.tolist(),
         "budgets": risk.budgets.tolist(),
         "budgets_in_transit": design.solver.transit_risk.budgets.tolist(),
         "beyond": risk.older_probability,
-        "rests": design.rest_limits.tolist(),
+        "rests": design.reference_limits.tolist(),
         "a": plant.a.tolist(),
         "b": plant.b.tolist(),
         "e": plant.e.tolist(),

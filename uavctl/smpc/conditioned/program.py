@@ -1,13 +1,13 @@
-"""The QP of an independent part: slew limits, rows, regulated plans, places of rest.
+"""The QP of an independent part: slew limits, rows, regulated plans, reference equilibria.
 
 1. `SlewRows`: the last gate lets a setpoint move by slew · tick in each tick, and inputs are held for a step. A change
    of up to slew · Δt has arrived with the last tick of its step: rows bound the change from step to step by that. While
    it moves, the setpoint lags the plan by half a step on average.
-2. `RegulatedRows`: plan of the regulator for the whole plant, and the room that it leaves in all rows: one product
+2. `RegulatedRows`: plan of the regulator for the whole plant, and the margin that it leaves in all rows: one product
    each. State rows stand side by side, part after part. Hard rows are in inputs alone and come part after part, each
    with its stages in order: rows of the input set, then both sides of its slew rows.
 3. `PartProgram`: min |z|² such that the rows are kept, with z = L'c and the change c of the regulator's inputs.
-4. `RestEquilibria`: the equilibrium nearest to a target that keeps given limits.
+4. `ReferenceEquilibria`: the equilibrium nearest to a target that keeps given limits.
 """
 
 from __future__ import annotations
@@ -135,13 +135,13 @@ class PartProgram:
         rows_x, rows_u = _select_directions(x_rows, above_x, below_x), _select_directions(u_rows, above_u, below_u)
         rows = np.vstack([rows_x, rows_u])
 
-        def index_rooms(state_rows: Index, hard_rows: Index) -> Index:
-            """Return the indices of the rooms (rows,) of one side."""
+        def index_margins(state_rows: Index, hard_rows: Index) -> Index:
+            """Return the indices of the margins (rows,) of one side."""
             at_x = columns.start + width * np.arange(steps)[:, None] + state_rows
             at_u = width * steps + hard.start + u_rows.shape[1] * np.arange(steps)[:, None] + hard_rows
             return np.append(np.where(state_rows >= 0, at_x, end).ravel(), np.where(hard_rows >= 0, at_u, end).ravel())
 
-        self._upper, self._lower = index_rooms(above_x, above_u), index_rooms(below_x, below_u)
+        self._upper, self._lower = index_margins(above_x, above_u), index_margins(below_x, below_u)
         self._width = above_u.size  # of the hard rows of a stage
         self._slews = range(len(rows_x) + pairs_u[0].size, len(rows_x) + self._width)  # those of the first stage
         soft = np.arange(len(rows)) < len(rows_x)
@@ -165,28 +165,28 @@ class PartProgram:
         z += self._path_map_u @ path_u[:, part.inputs].ravel()
         return z
 
-    def subtract_room(self, z: Array, room_x: Array, room_u: Array) -> None:
-        """Subtract the room that z uses, in the state rows (H, m) and the hard rows of the whole plant."""
-        room_x[:, self.columns] -= (self._x_of_z @ z).reshape(self._steps, -1)
-        room_u[self.hard] -= self._u_of_z @ z
+    def subtract_margin(self, z: Array, margin_x: Array, margin_u: Array) -> None:
+        """Subtract the margin that z uses, in the state rows (H, m) and the hard rows of the whole plant."""
+        margin_x[:, self.columns] -= (self._x_of_z @ z).reshape(self._steps, -1)
+        margin_u[self.hard] -= self._u_of_z @ z
 
-    def write_used_room(self, z: Array, used_room: Array) -> None:
-        """Write the room that z uses in the part's state rows into `used_room` (H, m), of the whole plant."""
-        used_room[:, self.columns] = self._x_of_z.dot(z).reshape(self._steps, -1)
+    def write_used_margin(self, z: Array, used_margin: Array) -> None:
+        """Write the margin that z uses in the part's state rows into `used_margin` (H, m), of the whole plant."""
+        used_margin[:, self.columns] = self._x_of_z.dot(z).reshape(self._steps, -1)
 
     @property
     def iterations(self) -> int:
         """Iterations of the last program."""
         return self._program.iterations
 
-    def solve(self, rooms: Array, reuse_rows: bool) -> Array | None:
+    def solve(self, margins: Array, reuse_rows: bool) -> Array | None:
         """Solve for z (n,); None without an optimum.
 
         Args:
-            rooms: Room of all rows for z = 0, less their back-offs; OPEN at the end.
+            margins: Margin of all rows for z = 0, less their back-offs; OPEN at the end.
             reuse_rows: Start from the active rows of the last program, which must be of the same question.
         """
-        upper, lower = rooms.take(self._upper), -rooms.take(self._lower)
+        upper, lower = margins.take(self._upper), -margins.take(self._lower)
         first_rows = None if reuse_rows else self._guess_rows(upper, lower)
         # Where two back-offs overlap, the mean stays in the middle.
         crossed = upper < lower
@@ -199,7 +199,7 @@ class PartProgram:
     def _guess_ramps(self, upper: Array, lower: Array) -> Sense | None:
         """Guess the active rows: the setpoint moves from the last one to the regulator's at the slew limit.
 
-        It arrives in the stage where the sum of the rooms of all slew rows so far is not negative.
+        It arrives in the stage where the sum of the margins of all slew rows so far is not negative.
         """
         first_rows = None
         for i in self._slews:
@@ -249,7 +249,7 @@ def _select_directions(rows: Array, above: Index, below: Index) -> Array:
     return np.asarray(chosen.reshape(-1, rows.shape[2]))
 
 
-class RestEquilibria:
+class ReferenceEquilibria:
     """Equilibria of one part that keep given limits."""
 
     def __init__(self, problem: ControlProblem, equilibria: Equilibria, part: Part) -> None:
@@ -272,16 +272,16 @@ class RestEquilibria:
         if not self._used.size or not self._coordinates.size:
             return
         y = reference[self._held]
-        room = sides[self._used] - self._rows @ y
-        if (room >= 0.0).all():
+        margin = sides[self._used] - self._rows @ y
+        if (margin >= 0.0).all():
             return
-        solution = self._program.solve(np.zeros(y.size), np.minimum(room, OPEN), np.full(room.size, -OPEN))
+        solution = self._program.solve(np.zeros(y.size), np.minimum(margin, OPEN), np.full(margin.size, -OPEN))
         if solution is not None:
             reference[self._states] = self._x_eq @ (y + solution[0])
 
 
 class RegulatedRows:
-    """Plan and rooms under the regulator, for a deviation dx (n_x,) of the state from its reference."""
+    """Plan and margins under the regulator, for a deviation dx (n_x,) of the state from its reference."""
 
     def __init__(self, problem: ControlProblem, law: Lqr, parts: Sequence[Part], slew: SlewRows) -> None:
         plant, steps, n_x = problem.plant, problem.horizon, problem.plant.n_x
@@ -334,9 +334,9 @@ class RegulatedRows:
         self._first, self._slew_row = np.concatenate([above, below]), np.concatenate([slew_row, slew_row])
         self._sign = np.repeat([1.0, -1.0], slew_row.size)
         x_map = problem.state_set.c[self.rows] @ states[1:]
-        self._room = np.asfortranarray(-np.vstack([x_map.reshape(-1, n_x), *hard]))
+        self._margin = np.asfortranarray(-np.vstack([x_map.reshape(-1, n_x), *hard]))
 
-    def compute_room(
+    def compute_margin(
         self,
         dx: Array,
         sides: Array,
@@ -344,7 +344,7 @@ class RegulatedRows:
         first: tuple[Array, Array] | None,
         tightening: Array | None = None,
     ) -> tuple[Array, Array]:
-        """Return the room of the state rows (H, m) and of the hard rows.
+        """Return the margin of the state rows (H, m) and of the hard rows.
 
         Args:
             dx: Deviation of the state (n_x,).
@@ -354,12 +354,12 @@ class RegulatedRows:
             tightening: Reduction of the right sides of the input set (m,); None: none.
         """
         # b - C x_t(dx), b - C u_t(dx), side ∓ D (u_t - u_(t-1))
-        room: Array = self._room.dot(dx)
-        room_x, hard = (
-            room[: self._steps * self.rows.size].reshape(self._steps, -1),
-            room[self._steps * self.rows.size :],
+        margin: Array = self._margin.dot(dx)
+        margin_x, hard = (
+            margin[: self._steps * self.rows.size].reshape(self._steps, -1),
+            margin[self._steps * self.rows.size :],
         )
-        room_x += sides
+        margin_x += sides
         hard += self._hard_sides
         if tightening is not None:
             hard[self._input_rows] -= tightening[self._row_u]
@@ -370,7 +370,7 @@ class RegulatedRows:
         else:
             d_sent, side = first
             hard[self._first] += side.take(self._slew_row) + self._sign * d_sent.take(self._slew_row)
-        return room_x, hard
+        return margin_x, hard
 
     def plan(self, dx: Array) -> tuple[Array, Array]:
         """Return inputs (H, n_u) and states (H+1, n_x), as deviations from the reference."""

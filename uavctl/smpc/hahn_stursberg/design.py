@@ -115,7 +115,7 @@ class Design:
     design_id: str  # hash of all the above
 
     @property
-    def rest_stage(self) -> int:
+    def arrival_stage(self) -> int:
         """N, the stage from which a plan rests [steps]."""
         return self.horizon - self.terminal.tau
 

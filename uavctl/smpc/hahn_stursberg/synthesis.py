@@ -27,7 +27,7 @@ from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, kappa
 from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, make_fixed, make_greedy
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.sets import Polytope, find_rest_input
+from uavctl.smpc.sets import Polytope, find_equilibrium_input
 
 # The sums of the Lyapunov equations end where a power of F is below this.
 _NEGLIGIBLE = 1e-20
@@ -383,7 +383,7 @@ def synthesize(
     if tau < 1:
         raise DesignError("smpc.tau", f"{tau} is no delay", "give at least 1 step")
     noise = plant.e @ plant.w @ plant.e.T
-    rest = find_rest_input(plant.a, plant.b, q_u, target)
+    rest = find_equilibrium_input(plant.a, plant.b, q_u, target)
     error = np.zeros_like(plant.a) if estimate_cov is None else estimate_cov
     k = np.zeros((plant.n_u, plant.n_x))
     tasks, starts = [], 0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.sets import Polytope, find_rest_input
+from uavctl.smpc.sets import Polytope, find_equilibrium_input
 
 _DOUBLINGS = 40  # 2^40 steps: enough for the largest radius allowed, 1 - 1e-9
 
@@ -177,7 +177,7 @@ def check_assumptions(
         DesignError: An item fails; the message names it with its figures.
     """
     k_sigma = terminal.k @ terminal.sigma_x @ terminal.k.T
-    rest = find_rest_input(plant.a, plant.b, q_u, target)
+    rest = find_equilibrium_input(plant.a, plant.b, q_u, target)
     radius, residual = terminal.spectral_radius, invariance_residual(terminal, plant.w)
     drop = lyapunov_residual(terminal)
     checks = (

@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.tasks import Cell, make_tasks
-from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, compute_rest_backoffs, quantile, spread_risk
+from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, allocate_by_price, compute_reference_backoffs, quantile
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.estimate import innovation_form
@@ -31,9 +31,9 @@ def steps_for(loss: float) -> int:
 def distances(link: AgeModel, steps: int, cov: Array | None = None, slew_mps3: float = np.inf, most: int = 1) -> Array:
     case = replace(problem("paper"), horizon=steps)
     deviations = np.sqrt([EAST[0] @ item @ EAST[0] for item in propagate_covariance(case.plant, steps)[1:]])
-    risk = spread_risk(link, deviations, ALLOWED, corner=2)
+    risk = allocate_by_price(link, deviations, ALLOWED, corner=2)
     slew = SlewRows(case.plant, case.input_set, slew_mps3)
-    return compute_rest_backoffs(case, risk, ALLOWED, slew, EAST, cov, most)
+    return compute_reference_backoffs(case, risk, ALLOWED, slew, EAST, cov, most)
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.6, 0.9])
@@ -45,7 +45,7 @@ def test_the_share_of_new_plans_with_slack_is_the_design_share(loss: float, nois
     plant = case.plant
     cov = innovation_form(plant, 0.1, 0.0, 0).estimate_cov if noisy else np.zeros((4, 4))
     (d,) = distances(bernoulli(np.array([1.0 - loss])), steps, cov)[0]
-    risk = spread_risk(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
+    risk = allocate_by_price(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
     backoff = quantile(risk.shares) * sigma(steps, cov)
     gap = np.minimum(rng.geometric(1.0 - loss, draws), steps)
     spread = propagate_covariance(plant, steps, cov) - cov
@@ -61,7 +61,7 @@ def test_the_share_of_new_plans_with_slack_is_the_design_share(loss: float, nois
         over |= state[:, 2] > room - backoff[s]
     share = over.mean()
     error = 5.0 * np.sqrt(share / draws)
-    resting = float(risk.weights @ norm.cdf(-d / sigma(steps, cov)))
+    resting = float(risk.age_probabilities @ norm.cdf(-d / sigma(steps, cov)))
     if resting < 0.99 * (ALLOWED - risk.older_probability):  # it is the slack that asks for the distance
         # Stages together leave more often than the worst of each gap alone, by a little.
         assert SLACK_SHARE * ALLOWED - error < share < 1.15 * SLACK_SHARE * ALLOWED + error
@@ -78,8 +78,8 @@ def sigma(steps: int, cov: Array) -> Array:
 def test_in_bursts_rest_at_all_ages_is_outside_as_often_as_allowed() -> None:
     link = gilbert_elliott(enter=1.0 / 7.0, leave=1.0 / 3.0, good_loss=0.0, bad_loss=1.0)
     (d,) = distances(link, 20)[0]
-    risk = spread_risk(link, sigma(20, np.zeros((4, 4))), ALLOWED, corner=2)
-    assert risk.weights @ norm.cdf(-d / sigma(20, np.zeros((4, 4)))) == pytest.approx(
+    risk = allocate_by_price(link, sigma(20, np.zeros((4, 4))), ALLOWED, corner=2)
+    assert risk.age_probabilities @ norm.cdf(-d / sigma(20, np.zeros((4, 4)))) == pytest.approx(
         ALLOWED - risk.older_probability, rel=1e-6
     )
 
@@ -107,8 +107,10 @@ def test_late_positions_are_counted_from_their_capture() -> None:
         def outage(self, age: int) -> float:
             return self._on_time.outage(age - 1) if age else 1.0
 
-    risk = spread_risk(Late(), sigma(case.horizon, np.zeros((4, 4))), ALLOWED, corner=2)
-    late = compute_rest_backoffs(case, risk, ALLOWED, SlewRows(case.plant, case.input_set, np.inf), EAST, None, 1)[0, 0]
+    risk = allocate_by_price(Late(), sigma(case.horizon, np.zeros((4, 4))), ALLOWED, corner=2)
+    late = compute_reference_backoffs(case, risk, ALLOWED, SlewRows(case.plant, case.input_set, np.inf), EAST, None, 1)[
+        0, 0
+    ]
     on_time = distances(bernoulli(np.array([0.7])), case.horizon)[0, 0]
     assert on_time + 0.5 < late < on_time + 3.0
 
@@ -117,11 +119,11 @@ def test_both_sides_of_a_box_are_equal_and_undisturbed_rows_need_no_distance() -
     case = problem("paper")
     solver = ConditionedSolver(case, bernoulli(np.array([0.7])), ALLOWED)
     positions = np.any(case.state_set.c[:, [0, 2]] != 0.0, axis=1)
-    kept = (case.state_set.b - solver.rest_limits())[positions]
+    kept = (case.state_set.b - solver.reference_limits())[positions]
     assert kept == pytest.approx(kept[0], rel=1e-9) and kept[0] > 1.0
     still = replace(case, plant=replace(case.plant, w=np.zeros((2, 2))))
     calm = ConditionedSolver(still, bernoulli(np.array([0.7])), ALLOWED)
-    assert calm.rest_limits() == pytest.approx(case.state_set.b)
+    assert calm.reference_limits() == pytest.approx(case.state_set.b)
 
 
 CORNER = 'set = ["target.position_m=[49, 19, 0]"]\nruns = 300\nsteps = 50\nstart = [46, 0, 17, 0]\n'
