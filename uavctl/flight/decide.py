@@ -109,7 +109,7 @@ def _begin(phase: _Phase, ordered: Ordered) -> Decided:
     if phase.context.inputs.stop:
         fallback = request_end(fallback, FallbackEnd.STOP, at_ns)
     return Decided(
-        plan=_age_plan(state.plan.flown, supervised),
+        plan=_mark_plan_outdated(state.plan.flown, supervised),
         fallback=fallback,
         mission=state.mission.progress,
         order=ordered.order,
@@ -121,10 +121,11 @@ def _begin(phase: _Phase, ordered: Ordered) -> Decided:
     )
 
 
-def _age_plan(plan: Plan | None, supervised: Supervised) -> Plan | None:
-    """Return the plan that is flown; any estimate is new beside one that was made from samples now dropped.
+def _mark_plan_outdated(plan: Plan | None, supervised: Supervised) -> Plan | None:
+    """Return the plan that flies. If its samples were dropped, its capture time is moved before the estimate's.
 
-    So it is for some steps (`replan`): the setpoint was far from where the new plan begins, and is slew-limited.
+    A plan is replaced once the estimate has a newer capture time. So a plan from dropped samples is replaced at the next
+    boundary, and for some steps after it (`replan`): the setpoint is slew-limited and far from the new plan's start.
     """
     if plan is None:
         return None
@@ -137,14 +138,10 @@ def _age_plan(plan: Plan | None, supervised: Supervised) -> Plan | None:
 
 def _update_biases(phase: _Phase) -> Biases:
     """Return the recent biases, without those from samples that were dropped, and with that of a new measurement."""
-    biases, context, view, clean_ns = (
-        phase.state.fallback.biases,
-        phase.context,
-        phase.view,
-        phase.supervised.dropped_after_ns,
-    )
-    if clean_ns is not None:
-        biases = tuple(one for one in biases if one[0] <= clean_ns)
+    biases, context, view = phase.state.fallback.biases, phase.context, phase.view
+    dropped_after_ns = phase.supervised.dropped_after_ns
+    if dropped_after_ns is not None:
+        biases = tuple((at_ns, bias) for at_ns, bias in biases if at_ns <= dropped_after_ns)
     if context.mode is not ControlMode.TRACK:
         return biases if phase.state.fallback.flown is not None else ()
     if not context.is_boundary or view.age_steps or view.estimate is None or not view.estimate.bias:
@@ -154,12 +151,8 @@ def _update_biases(phase: _Phase) -> Biases:
 
 def _decide_handed_over(begun: Decided, phase: _Phase) -> Decided | None:
     """Decide for a vehicle that is handed over, stopped, silent, or takes no setpoints; None for any other."""
-    inputs, why_not, at_ns, fallback = (
-        phase.context.inputs,
-        phase.context.not_ready_reason,
-        phase.context.at_ns,
-        begun.fallback,
-    )
+    inputs, why_not = phase.context.inputs, phase.context.not_ready_reason
+    at_ns, fallback = phase.context.at_ns, begun.fallback
     if fallback is not None and fallback.ended:
         return _fall_back(begun, fallback, phase, "handed over")
     is_stopped = inputs.stop or (fallback is not None and fallback.end is FallbackEnd.STOP)
