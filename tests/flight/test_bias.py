@@ -83,7 +83,7 @@ def found(bias: float, *, others_until: int = 0, order: int = 1, **changes: floa
     for k in range(0, 300, 2):
         pair = [sample(START_NS + i * DT_NS, position_m=(float(places[i]), 0.0, 0.0)) for i in (k, k + 1)]
         history, _, _ = absorb_samples(kalman, history, START_NS + (k + 1) * DT_NS, pair[::order])
-        history = note_input(kalman, history, START_NS + (k + 1) * DT_NS, None if k < others_until else np.zeros(1))
+        history = note_input(history, START_NS + (k + 1) * DT_NS, None if k < others_until else np.zeros(1))
     now = estimate_at(kalman, history, START_NS + 299 * DT_NS)
     assert now is not None and len(now.mean) == 3
     return now.bias
@@ -104,7 +104,7 @@ def test_what_happens_while_others_fly_is_no_bias() -> None:
 def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
     plant, parameters = small_plant(), estimator_parameters(bias_drift=DRIFT, bias_max=MOST)
     kalman = make_kalman(plant, parameters, DT_NS)
-    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     for k in range(1, 400):
         at_ns = START_NS + k * DT_NS
         history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns - 150 * MS, at_ns)])

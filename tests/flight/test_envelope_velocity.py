@@ -106,7 +106,7 @@ def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None
     state = monitors(
         observer=Observer(AT_NS - 3 * SECOND_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
         tick_ns=START_NS,
-        vehicle_path=((captured_ns - 50 * MS, np.zeros(3)), (START_NS, np.zeros(3))),
+        vehicle_path=((captured_ns - 50 * MS, ZERO), (START_NS, ZERO)),
         offsets=tuple((captured_ns - ns * MS, np.array([-0.3e-3 * ns, 0.0, 0.0])) for ns in (500, 250)),
     )
     watching, breach = update(state, seen(AT_NS, sample(captured_ns, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
@@ -151,7 +151,7 @@ def test_a_distance_that_begins_anew_is_not_compared_with_what_was_before(known:
     """Nor is one that is not known: this tick brings no position."""
     values = {"offsets": offsets(0.0)["offsets"], "places": ((START_NS - SECOND_NS, ZERO),)}
     before = monitors(tick_ns=START_NS, **{name: values[name] for name in known})
-    flown = ((START_NS, np.zeros(3)),)
+    flown = ((START_NS, ZERO),)
     for path, own, is_kept in (((), AT_REST, False), (flown, None, False), (flown, AT_REST, True)):
         after, _ = update(changed(before, vehicle_path=path), seen(AT_NS, vehicle_motion=own), PARAMETERS)
         kept = (bool(after.velocity.offsets), bool(after.velocity.places))
@@ -165,7 +165,7 @@ def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorStat
     """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
     known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
     middle_ns = AT_NS - 256 * MS
-    older = tuple((middle_ns - age_ns - n * SECOND_NS, np.zeros(3)) for n in range(before, 0, -1))
+    older = tuple((middle_ns - age_ns - n * SECOND_NS, ZERO) for n in range(before, 0, -1))
     places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
     return look(ZERO, vehicle_motion=AT_REST, places=places, **known)
 
@@ -233,10 +233,10 @@ def test_over_a_gap_the_way_is_not_compared() -> None:
         assert watching.velocity.places == (places if kept else ())
     silent, _ = look(ZERO, places=places, **offsets(0.0))
     missed, _ = look(
-        ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),))
+        ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, ZERO),))
     )
     assert silent.velocity.places == missed.velocity.places == ()
-    state = monitors(vehicle_path=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
+    state = monitors(vehicle_path=((START_NS, ZERO),), places=places)  # the way is not known so early
     early, _ = update(state, seen(AT_NS, sample(START_NS, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
     assert not early.velocity.offsets and not early.velocity.places
 
@@ -300,20 +300,20 @@ def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plai
 
 def test_the_way_is_known_between_ticks_and_not_before_the_first() -> None:
     for captured_ns, known in ((START_NS, False), (START_NS + 1, True), (AT_NS, True)):
-        state = monitors(vehicle_path=((START_NS, np.zeros(3)),))
+        state = monitors(vehicle_path=((START_NS, ZERO),))
         watching, _ = update(state, seen(AT_NS, sample(captured_ns, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
         assert [at for at, _ in watching.velocity.offsets] == [captured_ns] * known
 
 
 def test_the_way_is_not_known_after_the_last_tick() -> None:
-    way = tuple((START_NS - n * MS, np.zeros(3)) for n in range(300, -1, -1))
+    way = tuple((START_NS - n * MS, ZERO) for n in range(300, -1, -1))
     after = sample(AT_NS + 1, AT_NS + 1)
     watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, after, vehicle_motion=AT_REST), PARAMETERS)
     assert len(watching.motion.vehicle_path) == 302 and watching.velocity.offsets == ()
 
 
 def test_the_way_is_remembered_for_three_seconds() -> None:
-    way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * SECOND_NS, AT_NS - 3 * SECOND_NS + 1, START_NS))
+    way = tuple((at, ZERO) for at in (AT_NS - 3 * SECOND_NS, AT_NS - 3 * SECOND_NS + 1, START_NS))
     watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, vehicle_motion=AT_REST), PARAMETERS)
     assert [at for at, _ in watching.motion.vehicle_path] == [AT_NS - 3 * SECOND_NS + 1, START_NS, AT_NS]
 
@@ -341,10 +341,10 @@ def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotio
 
 @pytest.mark.parametrize(("gap_ns", "known"), [(300 * MS, True), (300 * MS + 1, False)])
 def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, known: bool) -> None:
-    before = offsets(0.0, vehicle_path=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
+    before = offsets(0.0, vehicle_path=((AT_NS - gap_ns, (1.0, 2.0, 3.0)),))
     watching, _ = look(ZERO, vehicle_motion=motion((1.0, 0.0, 0.0), AT_NS), **before)
     assert watching.motion.vehicle_path[-1][0] == AT_NS
-    assert watching.motion.vehicle_path[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
+    assert watching.motion.vehicle_path[-1][1] == ((1.0 + 0.3, 2.0, 3.0) if known else ZERO)
     assert [at for at, _ in watching.motion.vehicle_path[:-1]] == [AT_NS - gap_ns] * known
     assert len(watching.velocity.offsets) == (3 if known else 0)
 

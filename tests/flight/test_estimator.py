@@ -69,7 +69,7 @@ def fly(
         due = [one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns]
         history, _, _ = absorb_samples(kalman, history, at_ns, due)
         result.append(estimate_at(kalman, history, at_ns))
-        history = note_input(kalman, history, at_ns, np.full(kalman.n_u, inputs[tick]))
+        history = note_input(history, at_ns, np.full(kalman.n_u, inputs[tick]))
     return result
 
 
@@ -181,8 +181,8 @@ def test_the_belief_of_the_instant_may_be_given_with_an_input() -> None:
         due = [sample(at_ns - 3 * MS, at_ns, position_m=(float(rng.normal()), 0.0, 0.0))] if tick % 3 == 1 else []
         history, given = (absorb_samples(kalman, one, at_ns, due)[0] for one in (history, given))
         u = rng.normal(size=1)
-        history = note_input(kalman, history, at_ns, u)
-        given = note_input(kalman, given, at_ns, u, predict_belief(kalman, given, at_ns))
+        history = note_input(history, at_ns, u)
+        given = note_input(given, at_ns, u, predict_belief(kalman, given, at_ns))
         later_ns = at_ns + TICK_NS // 2
         assert repr(estimate_at(kalman, given, later_ns)) == repr(estimate_at(kalman, history, later_ns))
 
@@ -206,7 +206,7 @@ def test_the_belief_of_the_capture_time_may_be_given_with_a_sample() -> None:
             given, refused = insert_sample(kalman, advance_window(kalman, given, at_ns), one, belief)
             assert refused is None
         u = rng.normal(size=1)
-        history, given = (note_input(kalman, known, at_ns, u) for known in (history, given))
+        history, given = (note_input(known, at_ns, u) for known in (history, given))
         later_ns = at_ns + TICK_NS // 2
         assert repr(estimate_at(kalman, given, later_ns)) == repr(estimate_at(kalman, history, later_ns))
 
@@ -348,7 +348,7 @@ def test_duplicates_and_samples_beyond_the_window_are_refused_with_the_reason() 
 def test_nothing_is_known_before_the_first_sample() -> None:
     kalman, history = make()
     history, _, _ = absorb_samples(kalman, history, START_NS, [])
-    history = note_input(kalman, history, START_NS, np.array([1.0]))
+    history = note_input(history, START_NS, np.array([1.0]))
     assert estimate_at(kalman, history, START_NS) is None
     assert history.captured_ns is None
 
@@ -387,7 +387,7 @@ def test_exact_samples_with_velocity_give_the_measured_state_back() -> None:
         assert measured is not None
         np.testing.assert_allclose(measured.mean, x, rtol=0, atol=1e-5)
         u = rng.uniform(-7.5, 7.5, size=1)
-        history = note_input(kalman, history, at_ns, u)
+        history = note_input(history, at_ns, u)
         x = plant.a @ x + plant.b @ u + plant.e @ rng.normal(scale=0.6**0.5, size=1)
 
 
@@ -447,9 +447,10 @@ def test_a_stamp_after_the_arrival_counts_from_the_arrival() -> None:
     assert history.captured_ns == at_ns - 3 * MS
 
 
-def told(history: FilterHistory) -> list[str]:
+def told(kalman: Kalman, history: FilterHistory) -> list[str]:
     """All that is known, to the last bit."""
-    return [repr((history.origin_ns, history.window_begin_ns, history.anchor))] + [repr(one) for one in history.entries]
+    states = [predict_belief(kalman, history, entry.key[0]) for entry in history.entries]
+    return [repr((history.origin_ns, history.window_begin_ns, history.anchor)), repr(history.entries), repr(states)]
 
 
 @pytest.mark.slow
@@ -483,16 +484,16 @@ def test_what_is_taken_back_is_as_if_it_had_never_come(seed: int, bias_drift: fl
         never, _, _ = absorb_samples(kalman, never, at_ns, [one for one in due if not poisoned(one)])
         u = None if tick % 17 == 0 else rng.normal(size=1)
         if rng.random() < 0.6:
-            history, never = (note_input(kalman, known, at_ns, u) for known in (history, never))
-    assert taken_back > 3 and told(history) != told(never)
-    assert told(drop_samples(kalman, history, poisoned)) == told(never)
-    assert told(drop_samples(kalman, never, poisoned)) == told(never)
+            history, never = (note_input(known, at_ns, u) for known in (history, never))
+    assert taken_back > 3 and told(kalman, history) != told(kalman, never)
+    assert told(kalman, drop_samples(history, poisoned)) == told(kalman, never)
+    assert told(kalman, drop_samples(never, poisoned)) == told(kalman, never)
 
 
 def test_what_the_anchor_holds_is_not_taken_back() -> None:
     kalman, history = make()
     history, _, _ = absorb_samples(kalman, history, START_NS, [sample(START_NS)])
     history, _, _ = absorb_samples(kalman, history, START_NS + 3 * S, [sample(START_NS + 3 * S)])
-    history = drop_samples(kalman, history, lambda one: True)
+    history = drop_samples(history, lambda one: True)
     assert history.captured_ns == START_NS
     assert all(one.sample is None for one in history.entries)

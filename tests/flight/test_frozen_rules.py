@@ -39,7 +39,7 @@ def watched(values: list[float], source: str = "camera", watches: SourceRecords 
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, ())
         watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
-        history = note_input(KALMAN, history, one.received_ns, np.array([1.0]))
+        history = note_input(history, one.received_ns, np.array([1.0]))
     return watches
 
 
@@ -392,7 +392,7 @@ def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_to
     history = begin_history(KALMAN, START_NS, START_NS)
     one = sample(START_NS + 2 * TICK_NS, position_m=(0.5, 0.0, 0.0))
     history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
-    history = note_input(KALMAN, history, one.received_ns, np.array([1.0]))
+    history = note_input(history, one.received_ns, np.array([1.0]))
     late_ns = one.captured_ns + round(1.5e9 * KALMAN.parameters.window_s)
     history, _, _ = absorb_samples(KALMAN, history, late_ns, ())
     assert history.window_begin_ns > one.captured_ns
@@ -424,7 +424,7 @@ def judged(
         records, verdict = update(records, observation)
         if verdict.is_none:
             history, _, _ = absorb_samples(KALMAN, history, at_ns, (one,))
-        history = note_input(KALMAN, history, at_ns, np.array([accel_mps2]))
+        history = note_input(history, at_ns, np.array([accel_mps2]))
         open_loop_belief = records["camera"].open_loop_belief
         found.append((verdict.cause, math.nan if open_loop_belief is None else float(open_loop_belief.mean[0])))
     return found

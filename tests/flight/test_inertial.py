@@ -44,6 +44,7 @@ from uavctl.flight.estimator import (
     begin_history,
     distrust_inertial,
     estimate_at,
+    find_newest_belief,
     note_input,
     predict_ahead,
     predict_belief,
@@ -166,7 +167,7 @@ def test_equals_conditioning_positions_and_accelerations_at_once(monkeypatch: py
             if at_ns - TICK_NS < t <= at_ns:
                 history = update_inertial(kalman, history, felt_at(t, accel - 0.01, accel, accel + 0.01))
         if at_ns in inputs:
-            history = note_input(kalman, history, at_ns, np.array([inputs[at_ns]]))
+            history = note_input(history, at_ns, np.array([inputs[at_ns]]))
     mean, cov = known(kalman, history, at_ns)
     want_mean, want_cov = conditioned(places, accels, inputs, at_ns)
     np.testing.assert_allclose(mean, want_mean, rtol=0, atol=1e-9)
@@ -192,7 +193,7 @@ def test_late_positions_among_inertial_data_give_the_same_bits_as_positions_in_o
             due = [one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns]
             history, _, _ = absorb_samples(kalman, history, at_ns, due)
             history = update_inertial(kalman, history, felt_at(at_ns - 20 * MS, accels[tick]))
-            history = note_input(kalman, history, at_ns, inputs[tick : tick + 1])
+            history = note_input(history, at_ns, inputs[tick : tick + 1])
         return estimate_at(kalman, history, at_ns)
 
     assert flown(late=False) is not None
@@ -220,7 +221,7 @@ def blind(
 
 def test_a_force_that_begins_in_silence_is_felt_and_unfelt_is_not_known() -> None:
     kalman = make()
-    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     for tick in range(81):
         at_ns = START_NS + tick * TICK_NS
         history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
@@ -234,7 +235,7 @@ def test_a_force_that_begins_in_silence_is_felt_and_unfelt_is_not_known() -> Non
 
 def test_what_the_sensors_are_off_for_long_is_learnt_from_positions() -> None:
     kalman = make()
-    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     for tick in range(20 * 40):
         at_ns = START_NS + tick * TICK_NS
         history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
@@ -248,13 +249,13 @@ def test_what_the_sensors_are_off_for_long_is_learnt_from_positions() -> None:
 
 def followed(kalman: Kalman, seconds: float, told_mps2: Callable[[int], float], every: int = 4) -> list[Belief]:
     """Beliefs, tick by tick, of a vehicle at rest whose positions say so and whose inertial data say something."""
-    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     beliefs = []
     for tick in range(round(seconds * 1e9) // TICK_NS):
         at_ns = START_NS + tick * TICK_NS
         history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns)] if tick % every == 0 else [])
         history = update_inertial(kalman, history, felt_at(at_ns + MS, told_mps2(tick)))
-        belief = history.newest.belief
+        belief = find_newest_belief(kalman, history)
         assert belief is not None
         beliefs.append(belief)
     return beliefs
@@ -296,14 +297,14 @@ def test_a_doubt_outlives_positions_that_come_late_and_what_it_took_back_stays_s
     kalman = make()
 
     def told(*, lies: bool, late: bool) -> Belief:
-        history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+        history = note_input(begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
         for tick in range(20):
             at_ns = START_NS + tick * TICK_NS
             samples = [sample(at_ns)] if tick % 4 == 0 and tick <= 8 else []
             history, _, _ = absorb_samples(kalman, history, at_ns, samples)
             if tick < 8 or (lies and tick > 8):
                 history = update_inertial(kalman, history, felt_at(at_ns + MS, 0.1 if tick > 8 else 0.0))
-        history = distrust_inertial(kalman, history, at_ns + 2 * MS) if lies else history
+        history = distrust_inertial(history, at_ns + 2 * MS) if lies else history
         at_ns += TICK_NS
         if late:
             history, taken, _ = absorb_samples(kalman, history, at_ns, [sample(START_NS + 6 * TICK_NS, at_ns)])
@@ -369,7 +370,7 @@ def test_an_input_acts_when_its_dead_time_is_over_and_counts_ahead_before() -> N
     history, pending_inputs = begin_history(kalman, START_NS, START_NS), no_inputs()
     for tick, u in enumerate(inputs):
         at_ns = START_NS + tick * TICK_NS
-        history, pending_inputs = apply_due_inputs(kalman, history, pending_inputs, at_ns)
+        history, pending_inputs = apply_due_inputs(history, pending_inputs, at_ns)
         history, _, _ = absorb_samples(kalman, history, at_ns, [sample(START_NS)] if tick == 0 else [])
         ahead = predict_ahead(kalman, history, pending_inputs, at_ns, dead_ns)
         mean, cuts = np.zeros(3), [START_NS, *(START_NS + n * TICK_NS + dead_ns for n in range(tick)), at_ns + dead_ns]

@@ -185,9 +185,7 @@ def offsets(
 ) -> dict[str, Any]:
     """Offsets so long before AT_NS that grow by so much in a second; the vehicle says that it is at rest."""
     return {
-        "vehicle_path": ((START_NS, np.zeros(3)), (AT_NS - MS, np.zeros(3))),
-        "offsets": tuple(
-            (AT_NS - ns, np.array([place_m - speed_mps * ns * 1e-9, 0.0, 0.0])) for ns in sorted(spans_ns)[::-1]
-        ),
+        "vehicle_path": ((START_NS, ZERO), (AT_NS - MS, ZERO)),
+        "offsets": tuple((AT_NS - ns, (place_m - speed_mps * ns * 1e-9, 0.0, 0.0)) for ns in sorted(spans_ns)[::-1]),
         **known,
     }

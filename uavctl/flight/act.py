@@ -53,10 +53,10 @@ def act(
     if controller.dead_ns:
         pending_inputs = (*pending_inputs, (at_ns + controller.dead_ns, acting))
     else:
-        history = note_input(controller.kalman, history, at_ns, acting, supervised.view.belief)
+        history = note_input(history, at_ns, acting, supervised.view.belief)
     drop_after_ns = supervised.drop_later_after_ns
     if drop_after_ns is not None:
-        history = drop_samples(controller.kalman, history, lambda sample: read_capture_ns(sample) > drop_after_ns)
+        history = drop_samples(history, lambda sample: read_capture_ns(sample) > drop_after_ns)
     return Acted(setpoint, applied, history, pending_inputs)
 
 

@@ -92,7 +92,7 @@ def view_filter(history: FilterHistory, context: TickContext) -> FilterView:
     decided as it would have been then.
     """
     kalman, boundary_ns = context.controller.kalman, context.boundary_ns
-    captured_ns = find_newest_capture_ns(history, boundary_ns)
+    captured_ns = find_newest_capture_ns(kalman, history, boundary_ns)
     belief = predict_belief(kalman, history, context.at_ns)
     return FilterView(
         history=history,

@@ -124,8 +124,8 @@ def _begin(phase: _Phase, ordered: Ordered) -> Decided:
 def _mark_plan_outdated(plan: Plan | None, supervised: Supervised) -> Plan | None:
     """Return the plan that flies. If its samples were dropped, its capture time is moved before the estimate's.
 
-    A plan is replaced once the estimate has a newer capture time. So a plan from dropped samples is replaced at the next
-    boundary, and for some steps after it (`replan`): the setpoint is slew-limited and far from the new plan's start.
+    A plan is replaced once the estimate has a newer capture time. So a plan from dropped samples is replaced at the
+    next boundary, and for some steps after it (`replan`): the slew-limited setpoint is far from the new plan's start.
     """
     if plan is None:
         return None

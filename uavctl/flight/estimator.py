@@ -2,8 +2,8 @@
 
 1. A sorted history holds samples, inertial data and input changes. It begins at an anchor that follows the time at a
    distance of `window_s`.
-2. Each entry keeps the belief after it. A sample in order costs one update.
-3. A late sample is sorted in, and all beliefs after it are computed anew: the result is the same to the last bit.
+2. The belief after each entry is computed once, when it is asked for. A sample in order costs one update.
+3. A late sample is sorted in, and all beliefs after it are computed again: the result is the same to the last bit.
 4. Samples can be dropped again, as if they had not come.
 """
 
@@ -57,31 +57,28 @@ class FilterEvent(msgspec.Struct, frozen=True, eq=False):
     """Entry of the history: a sample, inertial data, an input change, or a mark (a boundary with its belief)."""
 
     key: Key
-    sample: PositionSample | None
-    input: Array | None  # of an input change; None: others fly from here on
-    after: FilterState
+    sample: PositionSample | None = None
+    input: Array | None = None  # of an input change; None: others fly from here on
     accel_mps2: Array | None = None  # of inertial data: what they show of each axis of the plant
     distrusts_inertial: bool = False  # inertial data are distrusted from here on
 
 
 class FilterHistory(msgspec.Struct, frozen=True, eq=False):
-    """State of the filter; immutable."""
+    """State of the filter; immutable but for `states`, which follow from all else and are filled in when asked for."""
 
     origin_ns: int  # A boundary of the Δt grid [ns]
     window_begin_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
     anchor: FilterState  # state of the filter at the horizon
     entries: tuple[FilterEvent, ...] = ()  # entries since then, sorted by key
-
-    @property
-    def newest(self) -> FilterState:
-        """State of the filter after all entries."""
-        return self.entries[-1].after if self.entries else self.anchor
+    states: list[FilterState] = []  # states of the filter after the first entries, as far as they are known
 
     @property
     def captured_ns(self) -> int | None:
         """Capture time of the newest sample, None before the first."""
-        belief = self.newest.belief
-        return None if belief is None else belief.captured_ns
+        for entry in reversed(self.entries):
+            if entry.sample is not None:
+                return entry.key[0]
+        return None if self.anchor.belief is None else self.anchor.belief.captured_ns
 
 
 def begin_history(kalman: Kalman, origin_ns: int, at_ns: int) -> FilterHistory:
@@ -101,8 +98,12 @@ def advance_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> Filter
 
 
 def move_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
-    """Move the window up to `at_ns`."""
-    return _trim(history, max(history.window_begin_ns, _compute_window_begin_ns(kalman, at_ns)))
+    """Move the window up to `at_ns`, and its anchor to the state at its begin."""
+    begin_ns, past = max(history.window_begin_ns, _compute_window_begin_ns(kalman, at_ns)), 0
+    while past < len(history.entries) and history.entries[past].key[0] <= begin_ns:
+        past += 1
+    anchor = _compute_state(kalman, history, past)
+    return FilterHistory(history.origin_ns, begin_ns, anchor, history.entries[past:], history.states[past:])
 
 
 def is_mark_due(kalman: Kalman, history: FilterHistory, at_ns: int) -> bool:
@@ -115,7 +116,7 @@ def is_mark_due(kalman: Kalman, history: FilterHistory, at_ns: int) -> bool:
 def insert_mark(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
     """Keep a belief at the last boundary."""
     mark = _find_mark(kalman, history, at_ns)
-    return _insert(kalman, history, FilterEvent(key=mark, sample=None, input=None, after=history.newest), None)
+    return _insert(history, FilterEvent(key=mark))
 
 
 def _find_mark(kalman: Kalman, history: FilterHistory, at_ns: int) -> Key:
@@ -160,8 +161,13 @@ def insert_sample(
         return history, EventCode.SAMPLE_TOO_OLD
     if _is_duplicate(history.entries, key):
         return history, EventCode.SAMPLE_DUPLICATE
-    new = FilterEvent(key=key, sample=sample, input=None, after=history.anchor)
-    return _insert(kalman, history, new, belief), None
+    new = FilterEvent(key=key, sample=sample)
+    place = bisect_right(history.entries, key, key=_KEY)
+    inserted, later = _insert(history, new), history.entries[place:]
+    if belief is not None and len(history.states) >= place and not (later and later[0].key[0] == key[0]):
+        # The prediction is this one, and not that of a later entry of the same instant.
+        inserted.states.append(_apply_entry(kalman, history, _compute_state(kalman, history, place), new, belief))
+    return inserted, None
 
 
 def update_inertial(kalman: Kalman, history: FilterHistory, samples: Sequence[InertialSample]) -> FilterHistory:
@@ -177,25 +183,15 @@ def update_inertial(kalman: Kalman, history: FilterHistory, samples: Sequence[In
         return history
     mean = average_vectors([one.accel_mps2 for one in readings])
     accel = np.array([mean[axis] for axis in kalman.axes])
-    key = (at_ns, _INERTIAL, "", at_ns)
-    new = FilterEvent(key=key, sample=None, input=None, after=history.anchor, accel_mps2=accel)
-    return _insert(kalman, history, new, None)
+    return _insert(history, FilterEvent(key=(at_ns, _INERTIAL, "", at_ns), accel_mps2=accel))
 
 
-def distrust_inertial(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
+def distrust_inertial(history: FilterHistory, at_ns: int) -> FilterHistory:
     """Drop the inertial data since the newest position of the window, and distrust those that come."""
     newest = max((place for place, entry in enumerate(history.entries) if entry.sample is not None), default=-1)
-    node, kept = history.anchor, []
-    for place, entry in enumerate(history.entries):
-        if place > newest and entry.accel_mps2 is not None:
-            continue
-        node = _apply_entry(kalman, history.origin_ns, node, entry)
-        kept.append(replace(entry, after=node))
-    history = replace(history, entries=tuple(kept))
-    mark = FilterEvent(
-        key=(at_ns, _MARK, "doubted", at_ns), sample=None, input=None, after=node, distrusts_inertial=True
-    )
-    return _insert(kalman, history, mark, None)
+    kept = [entry for place, entry in enumerate(history.entries) if place <= newest or entry.accel_mps2 is None]
+    history = _keep_entries(history, kept)
+    return _insert(history, FilterEvent(key=(at_ns, _MARK, "distrusted", at_ns), distrusts_inertial=True))
 
 
 def average_vectors(vectors: Sequence[Vec3]) -> Vec3:
@@ -222,20 +218,14 @@ def _is_duplicate(entries: Sequence[FilterEvent], key: Key) -> bool:
     return False
 
 
-def drop_samples(kalman: Kalman, history: FilterHistory, dropped: Callable[[PositionSample], bool]) -> FilterHistory:
+def drop_samples(history: FilterHistory, dropped: Callable[[PositionSample], bool]) -> FilterHistory:
     """Drop samples of the window, as if they had not come."""
-    node, kept = history.anchor, []
-    for entry in history.entries:
-        if entry.sample is not None and dropped(entry.sample):
-            continue
-        node = _apply_entry(kalman, history.origin_ns, node, entry)
-        kept.append(replace(entry, after=node))
-    return replace(history, entries=tuple(kept))
+    return _keep_entries(
+        history, [entry for entry in history.entries if entry.sample is None or not dropped(entry.sample)]
+    )
 
 
-def note_input(
-    kalman: Kalman, history: FilterHistory, at_ns: int, u: Array | None, belief: Belief | None = None
-) -> FilterHistory:
+def note_input(history: FilterHistory, at_ns: int, u: Array | None, belief: Belief | None = None) -> FilterHistory:
     """Note that an input acts from now on.
 
     Args:
@@ -243,24 +233,25 @@ def note_input(
         u: The input (n_u,); None: others fly.
         belief: What `predict_belief` gives at `at_ns`, if that has been asked.
     """
-    before = history.newest.input
+    before = _find_newest_input(history)
     if before is u or (before is not None and u is not None and before.tolist() == u.tolist()):
         return history
-    after = FilterState(belief=belief or predict_belief(kalman, history, at_ns), input=u)
-    entry = FilterEvent(key=(at_ns, _INPUT, "", at_ns), sample=None, input=u, after=after)
-    place = bisect_right(history.entries, entry.key, key=_KEY)
-    marks = (replace(mark, after=after) for mark in history.entries[place:])  # of the same instant
-    return replace(history, entries=(*history.entries[:place], entry, *marks))
+    new = FilterEvent(key=(at_ns, _INPUT, "", at_ns), input=u)
+    place = bisect_right(history.entries, new.key, key=_KEY)
+    inserted = _insert(history, new)
+    if belief is not None and len(history.states) >= place:
+        inserted.states.append(FilterState(belief=belief, input=u))
+    return inserted
 
 
 def apply_due_inputs(
-    kalman: Kalman, history: FilterHistory, pending_inputs: PendingInputs, at_ns: int
+    history: FilterHistory, pending_inputs: PendingInputs, at_ns: int
 ) -> tuple[FilterHistory, PendingInputs]:
     """Note the inputs that have begun to act by `at_ns`; those that have not are left."""
     for due_ns, u in pending_inputs:
         if due_ns > at_ns:
             break
-        history = note_input(kalman, history, due_ns, u)
+        history = note_input(history, due_ns, u)
         pending_inputs = pending_inputs[1:]
     return history, pending_inputs
 
@@ -272,7 +263,7 @@ def predict_ahead(
     belief = predict_belief(kalman, history, at_ns)
     if belief is None or not ahead_ns:
         return belief
-    u = _find_state(history, at_ns).input
+    u = _find_state(kalman, history, at_ns).input
     acted: list[tuple[int, Array | None]] = []
     for entry in reversed(history.entries):  # of a window, a few are newer
         if entry.key[0] <= at_ns:
@@ -315,15 +306,15 @@ def select_covariance(kalman: Kalman, belief: Belief) -> Array:
     return np.ascontiguousarray(belief.cov[:n, :n])
 
 
-def find_newest_capture_ns(history: FilterHistory, at_ns: int) -> int | None:
+def find_newest_capture_ns(kalman: Kalman, history: FilterHistory, at_ns: int) -> int | None:
     """Find the capture time of the newest sample up to `at_ns`; None where there is no estimate."""
-    belief = _find_state(history, at_ns).belief
+    belief = _find_state(kalman, history, at_ns).belief
     return None if belief is None or belief.at_ns > at_ns else belief.captured_ns
 
 
 def predict_belief(kalman: Kalman, history: FilterHistory, at_ns: int) -> Belief | None:
     """Predict the belief at `at_ns` from all that had come by then; None where there is none, as with `estimate_at`."""
-    node = _find_state(history, at_ns)
+    node = _find_state(kalman, history, at_ns)
     if node.belief is None or node.belief.at_ns > at_ns:
         return None
     return predict(kalman, history.origin_ns, node.belief, node.input, at_ns)
@@ -331,7 +322,7 @@ def predict_belief(kalman: Kalman, history: FilterHistory, at_ns: int) -> Belief
 
 def predict_without_samples(kalman: Kalman, history: FilterHistory, belief: Belief, at_ns: int) -> Belief:
     """Predict an earlier belief for `at_ns` by the inputs that acted, without the samples since."""
-    u = _find_state(history, belief.at_ns).input
+    u = _find_state(kalman, history, belief.at_ns).input
     for entry in history.entries:
         if entry.key[1] == _INPUT and belief.at_ns < entry.key[0] < at_ns:
             belief = predict(kalman, history.origin_ns, belief, u, entry.key[0])
@@ -339,49 +330,67 @@ def predict_without_samples(kalman: Kalman, history: FilterHistory, belief: Beli
     return predict(kalman, history.origin_ns, belief, u, at_ns)
 
 
-def _find_state(history: FilterHistory, at_ns: int) -> FilterState:
+def find_newest_belief(kalman: Kalman, history: FilterHistory) -> Belief | None:
+    """Find the belief after all that has come; None before the first sample."""
+    return _compute_state(kalman, history, len(history.entries)).belief
+
+
+def _find_newest_input(history: FilterHistory) -> Array | None:
+    """Find the input that acts after all that has come."""
+    for entry in reversed(history.entries):
+        if entry.key[1] == _INPUT:
+            return entry.input
+    return history.anchor.input
+
+
+def _find_state(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterState:
     """Find the state of the filter after all that had come by `at_ns`."""
-    for entry in reversed(history.entries):  # one of the newest, as a rule
-        if entry.key[0] <= at_ns:
-            return entry.after
-    return history.anchor
+    count = len(history.entries)
+    while count and history.entries[count - 1].key[0] > at_ns:  # few are newer, as a rule
+        count -= 1
+    return _compute_state(kalman, history, count)
+
+
+def _compute_state(kalman: Kalman, history: FilterHistory, count: int) -> FilterState:
+    """Compute the state of the filter after the first `count` entries, from those that are known."""
+    states = history.states
+    while len(states) < count:
+        before = states[-1] if states else history.anchor
+        states.append(_apply_entry(kalman, history, before, history.entries[len(states)]))
+    return states[count - 1] if count else history.anchor
 
 
 def _compute_window_begin_ns(kalman: Kalman, at_ns: int) -> int:
     return at_ns - round(kalman.parameters.window_s * 1e9)
 
 
-def _insert(kalman: Kalman, history: FilterHistory, new: FilterEvent, belief: Belief | None) -> FilterHistory:
-    """Sort an entry in and compute the beliefs from there on; `belief` is its own prediction, if that is known."""
+def _insert(history: FilterHistory, new: FilterEvent) -> FilterHistory:
+    """Sort an entry in; the states from there on are not known any more."""
     entries = history.entries
     place = bisect_right(entries, new.key, key=_KEY)
-    node = entries[place - 1].after if place else history.anchor
-    later = entries[place:]
-    if later and later[0].key[0] == new.key[0]:
-        belief = None  # it may be that of the later one
-    node = _apply_entry(kalman, history.origin_ns, node, new, belief)
-    changed = [replace(new, after=node)]
-    for entry in later:
-        node = _apply_entry(kalman, history.origin_ns, node, entry)
-        changed.append(replace(entry, after=node))
-    return replace(history, entries=(*entries[:place], *changed))
+    return FilterHistory(
+        origin_ns=history.origin_ns,
+        window_begin_ns=history.window_begin_ns,
+        anchor=history.anchor,
+        entries=(*entries[:place], new, *entries[place:]),
+        states=history.states[:place],
+    )
 
 
-def _trim(history: FilterHistory, window_begin_ns: int) -> FilterHistory:
-    """Move the anchor up to the horizon."""
-    past = 0
-    while past < len(history.entries) and history.entries[past].key[0] <= window_begin_ns:
-        past += 1
-    anchor = history.entries[past - 1].after if past else history.anchor
-    return replace(history, window_begin_ns=window_begin_ns, anchor=anchor, entries=history.entries[past:])
+def _keep_entries(history: FilterHistory, kept: Sequence[FilterEvent]) -> FilterHistory:
+    """Drop all other entries; the states from the first one dropped on are not known any more."""
+    same = 0
+    while same < len(kept) and kept[same] is history.entries[same]:
+        same += 1
+    return replace(history, entries=tuple(kept), states=history.states[:same])
 
 
 def _apply_entry(
-    kalman: Kalman, origin_ns: int, node: FilterState, entry: FilterEvent, belief: Belief | None = None
+    kalman: Kalman, history: FilterHistory, before: FilterState, entry: FilterEvent, belief: Belief | None = None
 ) -> FilterState:
-    """Apply an entry to the state of the filter; `belief` is the prediction for it, if that is known."""
-    if belief is None and node.belief is not None:
-        belief = predict(kalman, origin_ns, node.belief, node.input, entry.key[0])
+    """Apply an entry to the state of the filter before it; `belief` is the prediction for it, if that is known."""
+    if belief is None and before.belief is not None:
+        belief = predict(kalman, history.origin_ns, before.belief, before.input, entry.key[0])
     if entry.sample is not None:
         belief = (
             make_first_belief(kalman, entry.sample)
@@ -389,7 +398,7 @@ def _apply_entry(
             else update_with_position(kalman, belief, entry.sample)
         )
     elif entry.accel_mps2 is not None and belief is not None:
-        belief = update_with_inertial(kalman, belief, entry.accel_mps2, node.input)
+        belief = update_with_inertial(kalman, belief, entry.accel_mps2, before.input)
     if entry.distrusts_inertial and belief is not None and belief.inertial.distrusted_ns is None:
         belief = replace(belief, inertial=replace(belief.inertial, distrusted_ns=entry.key[0]))
-    return FilterState(belief=belief, input=entry.input if entry.key[1] == _INPUT else node.input)
+    return FilterState(belief=belief, input=entry.input if entry.key[1] == _INPUT else before.input)

@@ -16,6 +16,7 @@ import numpy as np
 from uavctl.event_codes import MISSION, EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.decide import Decided
+from uavctl.flight.estimator import find_newest_belief
 from uavctl.flight.fallback import Fallback, FallbackEnd
 from uavctl.flight.link_estimate import LinkBelief, count_step, estimate_link
 from uavctl.flight.measure import Measured
@@ -177,9 +178,11 @@ def _report_link(alarms: tuple[str, ...], reported: tuple[str, ...], link: LinkE
 
 def _find_inertial_use(context: TickContext, supervised: Supervised) -> str:
     """Find the use of the vehicle's inertial data as an event code; empty if none are used or we do not fly."""
-    history = supervised.view.history
-    belief, we_fly = history.newest.belief, context.is_flown and context.is_ours
-    if not context.controller.kalman.n_inertial or belief is None or not we_fly:
+    history, kalman = supervised.view.history, context.controller.kalman
+    if not (kalman.n_inertial and context.is_flown and context.is_ours):
+        return ""
+    belief = find_newest_belief(kalman, history)
+    if belief is None:
         return ""
     if belief.inertial.distrusted_ns is not None:
         return EventCode.INERTIAL_DOUBTED

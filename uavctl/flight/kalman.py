@@ -206,7 +206,7 @@ def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_
             if u is None and kalman.n_bias:
                 _reset_bias(kalman, mean, cov)
         now_ns = stop_ns
-    return replace(belief, at_ns=now_ns, mean=mean, cov=cov)
+    return Belief(now_ns, belief.captured_ns, mean, cov, belief.inertial)
 
 
 def _uses_inertial(trust: InertialTrust, at_ns: int) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -28,10 +29,15 @@ class LinkEstimateParameters:
     credible: float = 0.95  # level of the lower bound, and of `below_promise`
     false_alarm: float = 0.001  # probability at which independent losses are taken for bursts, at one boundary
 
-    @property
+    @cached_property
     def forgetting(self) -> float:
         """Weight of an observation one step later."""
         return float(0.5 ** (1.0 / self.half_life_steps))
+
+    @cached_property
+    def burst_threshold(self) -> float:
+        """Statistic beyond which losses come in bursts: the quantile of a standard normal variable."""
+        return -float(ndtri(self.false_alarm))
 
 
 class LinkBelief(msgspec.Struct, frozen=True):
@@ -81,7 +87,7 @@ def estimate_link(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns:
     of a two-state chain).
     """
     statistic, correlation = compute_burst_statistic(belief), _correlation(belief)
-    bursts = statistic > -float(ndtri(parameters.false_alarm))
+    bursts = statistic > parameters.burst_threshold
     share = (1.0 - correlation) / (1.0 + correlation) if bursts else 1.0
     arrived, lost = share * belief.arrived, share * belief.lost
     return LinkEstimate(

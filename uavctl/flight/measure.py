@@ -77,7 +77,7 @@ def measure(state: ControlState, context: TickContext) -> Measured:
     kalman = controller.kalman
     origin_ns = inputs.at_ns - inputs.tick * controller.tick_ns
     history = estimator.history or begin_history(kalman, origin_ns, inputs.at_ns)
-    history, pending_inputs = apply_due_inputs(kalman, history, estimator.pending_inputs, inputs.at_ns)
+    history, pending_inputs = apply_due_inputs(history, estimator.pending_inputs, inputs.at_ns)
     is_due = is_mark_due(kalman, history, inputs.at_ns)
     samples = gate_samples(
         kalman, controller.reach, history, estimator.sources, inputs, controller.horizon, estimator.consecutive_samples
@@ -232,10 +232,10 @@ def _drop_repeats(
     The value that first came then goes too: it may be an older one, which the link had lost when it was new. It stays
     where nothing else is known.
     """
-    cleaned = drop_samples(kalman, history, is_repeat)
-    last_ns = find_newest_capture_ns(cleaned, first_ns)
+    cleaned = drop_samples(history, is_repeat)
+    last_ns = find_newest_capture_ns(kalman, cleaned, first_ns)
     if last_ns is None:
-        cleaned = drop_samples(kalman, history, lambda one: is_repeat(one) and read_capture_ns(one) > first_ns)
+        cleaned = drop_samples(history, lambda one: is_repeat(one) and read_capture_ns(one) > first_ns)
         last_ns = first_ns
     if len(cleaned.entries) == len(history.entries):
         return history, clean_ns

@@ -91,4 +91,6 @@ def _make_row(values: Array) -> Vector:
 
 
 def _make_rows(values: Array) -> Matrix:
+    if values.strides[0] == 0 and len(values):  # one row, broadcast
+        return (_make_row(values[0]),) * len(values)
     return tuple(map(tuple, values.tolist()))

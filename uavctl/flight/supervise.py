@@ -31,7 +31,6 @@ from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import FilterView, TickContext, observe_motion, read_position, read_velocity, view_filter
-from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import (
     FilterHistory,
     distrust_inertial,
@@ -110,14 +109,14 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
     view = view_filter(measured.history, context)
     inertial_verdict = _judge_inertial(state, view, context)
     if not inertial_verdict.is_none:
-        view = view_filter(distrust_inertial(controller.kalman, view.history, at_ns), context)
+        view = view_filter(distrust_inertial(view.history, at_ns), context)
     return_ordered = _is_return_ordered(state, view, context)
     monitors, released = _watch_flight(state, view, measured, context, return_ordered)
     sources = _judge_sources(measured, context)
     clean_ns, consecutive = samples.dropped_after_ns, samples.consecutive_samples
     if not (released.is_none and sources.is_none):
         clean_ns, consecutive = min(clean_ns or at_ns, monitors.consistent_ns or at_ns), 0
-        view = view_filter(_drop_after(view.history, clean_ns, controller), context)
+        view = view_filter(_drop_after(view.history, clean_ns), context)
     if context.is_boundary and view.age_steps is not None and view.age_steps >= controller.horizon:
         consecutive = 0
     external_state, late = _judge_answer(state, context)
@@ -154,9 +153,9 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
     )
 
 
-def _drop_after(history: FilterHistory, clean_ns: int, controller: Controller) -> FilterHistory:
+def _drop_after(history: FilterHistory, clean_ns: int) -> FilterHistory:
     """Drop what was captured after `clean_ns` and believed."""
-    return drop_samples(controller.kalman, history, lambda sample: read_capture_ns(sample) > clean_ns)
+    return drop_samples(history, lambda sample: read_capture_ns(sample) > clean_ns)
 
 
 def _judge_inertial(state: ControlState, view: FilterView, context: TickContext) -> Verdict:

@@ -83,7 +83,7 @@ def test_estimates_are_those_of_the_flight_s_filter(preset: str, link: str) -> N
             assert reported is not None
             assert means[k][run] == pytest.approx(reported.mean, abs=1e-8)
             assert covs[k][run] == pytest.approx(np.array(reported.cov), rel=1e-7, abs=1e-10)
-            history = note_input(kalman, history, k * dt_ns, inputs[run, k])
+            history = note_input(history, k * dt_ns, inputs[run, k])
     assert (overtaken > 0) == (link != "losses")
 
 

@@ -46,7 +46,7 @@ class Motion(msgspec.Struct, frozen=True, eq=False):
     model_mps2: Vector = ZERO  # the acceleration (3,) that belongs to it
     sent: tuple[tuple[int, Vec3], ...] = ()  # setpoints, each with the tick from which it acted [ns], oldest first
     # (at_ns, distance (3,)) flown by the vehicle's own velocity; empty while that does not come
-    vehicle_path: tuple[tuple[int, Array], ...] = ()
+    vehicle_path: tuple[tuple[int, Vector], ...] = ()
     inertial_path: InertialPath = ()  # the path that inertial data show; empty before any
     push_mps2: Vec3 = ZERO  # acceleration beside what was sent, when inertial data last explained it
     observer: Observer | None = None  # None before the first position
@@ -101,17 +101,18 @@ def _remember_setpoint(motion: Motion, observation: Observation) -> tuple[tuple[
     return sent[first:] if first else sent
 
 
-def _extend_vehicle_path(motion: Motion, observation: Observation) -> tuple[tuple[int, Array], ...]:
+def _extend_vehicle_path(motion: Motion, observation: Observation) -> tuple[tuple[int, Vector], ...]:
     """Add a tick to the distance by the vehicle's own velocity; a path of one entry has just begun."""
     at_ns, velocity = observation.at_ns, read_vehicle_velocity(observation.motion, observation.at_ns)
     if velocity is None:
         return ()
     path = motion.vehicle_path
     if not path or at_ns - path[-1][0] > MOTION_NS:  # nobody knows how far the vehicle flew in missed ticks
-        return ((at_ns, np.zeros(3)),)
+        return ((at_ns, ZERO),)
     last_ns, distance = path[-1]
     # s = s + Δt v
-    distance = distance + (at_ns - last_ns) * 1e-9 * np.array(velocity)
+    s = (at_ns - last_ns) * 1e-9
+    distance = tuple(flown + s * v for flown, v in zip(distance, velocity, strict=True))
     kept = path[bisect_right(path, at_ns - KEPT_NS, key=_TIME) :]
     return (*kept, (at_ns, distance))
 
@@ -202,12 +203,12 @@ def bound_gusts_mps(for_s: float, parameters: EnvelopeParameters) -> float:
     return GUSTS * parameters.unexplained_mps2 * for_s
 
 
-def find_distance(path: tuple[tuple[int, Array], ...], at_ns: int) -> Array | None:
+def find_distance(path: tuple[tuple[int, Vector], ...], at_ns: int) -> Vector | None:
     """Find the distance (3,) flown by the vehicle's own velocity at a time; None where that is not known."""
     after = bisect_left(path, at_ns, key=_TIME)
     if not 0 < after < len(path):
         return None
     (begin_ns, begin), (end_ns, end) = path[after - 1 : after + 1]
     # s = s_0 + (t - t_0) / (t_1 - t_0) (s_1 - s_0)
-    between: Array = begin + (at_ns - begin_ns) / (end_ns - begin_ns) * (end - begin)
-    return between
+    part = (at_ns - begin_ns) / (end_ns - begin_ns)
+    return tuple(a + part * (b - a) for a, b in zip(begin, end, strict=True))

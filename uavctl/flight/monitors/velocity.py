@@ -42,7 +42,9 @@ DRIFT_S, DRIFT_PART = 2.0, 0.16
 LEAST_OFFSETS = 3  # for a slope
 _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
 
-Offsets = tuple[tuple[int, Array], ...]  # (capture time [ns], position minus the vehicle's own distance (3,)), in order
+Offsets = tuple[
+    tuple[int, Vector], ...
+]  # (capture time [ns], position minus the vehicle's own distance (3,)), in order
 
 Places = tuple[tuple[int, Vector], ...]  # the same, means over the window
 
@@ -113,7 +115,8 @@ def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:
         return ()
     since_ns = at_ns - observation.parameters.window_ns
     kept = (one for one in offsets if one[0] > since_ns)
-    return (*kept, (at_ns, observation.position - distance))
+    offset = tuple(p - s for p, s in zip(observation.position.tolist(), distance, strict=True))
+    return (*kept, (at_ns, offset))
 
 
 def _find_drift(
@@ -146,7 +149,7 @@ def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) 
     return slope
 
 
-def _remove_delay(apart: Array, path: tuple[tuple[int, Array], ...], offsets: Offsets) -> Array:
+def _remove_delay(apart: Array, path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> Array:
     """Return a difference of velocities (3,) without the part that late stamps explain.
 
     Late stamps make a difference of the mean acceleration, by the vehicle's own distance, times their delay.
@@ -156,7 +159,7 @@ def _remove_delay(apart: Array, path: tuple[tuple[int, Array], ...], offsets: Of
     if begin is None or middle is None or end is None:
         return apart
     # ā = 4 (s_0 - 2 s_½ + s_1) / T²
-    accel = (begin - 2.0 * middle + end) * 4.0 / ((end_ns - begin_ns) * 1e-9) ** 2
+    accel = (np.array(begin) - 2.0 * np.array(middle) + np.array(end)) * 4.0 / ((end_ns - begin_ns) * 1e-9) ** 2
     along = float(accel @ accel)
     # τ = -Δv' ā / ā' ā, within ±0.15 s; Δv + τ ā
     late_s = min(max(-float(apart @ accel) / along, -LATE_S), LATE_S) if along > 0.0 else 0.0

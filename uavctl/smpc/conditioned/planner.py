@@ -156,7 +156,7 @@ class ConditionedSolver:
         self._placed = placed[self._reference_rows]
         self._box = all(np.count_nonzero(row) == 1 for row in problem.input_set.c)
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
-        self._no_backoff = np.zeros((steps, problem.input_set.b.size))
+        self._no_backoff = np.broadcast_to(np.zeros(problem.input_set.b.size), (steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
         # Rooms of all rows minus their back-offs, and the view of the state rows (H, m)
         self._margins = np.full(width * steps + hard + 1, OPEN)
