@@ -92,7 +92,7 @@ class FlightAccount:
     ends_in_flight: bool = False
     goal: str = ""
     has_arrived: bool = False
-    release_reason: str = ""
+    breach_reason: str = ""
     was_controlled: bool = False
     was_engaged: bool = False
     is_over: bool = False
@@ -157,7 +157,7 @@ class FlightAccount:
             elif event.code == EventCode.CONTROLLER_FAULT:
                 self._fallback_reason = event.text
         has_ended = decision.mode in (ControlMode.LAND, ControlMode.STOPPED) and before in _FLOWN_MODES
-        if has_ended and not (is_ended_from_outside or self.release_reason or self.control_error):
+        if has_ended and not (is_ended_from_outside or self.breach_reason or self.control_error):
             self._note_fallback_end(decision)
 
     def _note_fallback_end(self, decision: Decision) -> None:
@@ -292,7 +292,7 @@ class FlightAccount:
     @property
     def end_sentence(self) -> str:
         """The sentence of an end that has come, or is under way; empty while it flies, or has yet to."""
-        has_cause = self._cause or self._requested_end or self.release_reason or self.control_error
+        has_cause = self._cause or self._requested_end or self.breach_reason or self.control_error
         is_ending = self.is_over or has_cause or self._connection_error or self._signal
         return self.compute_ending(is_over=True).sentence if is_ending else ""
 
@@ -304,8 +304,8 @@ class FlightAccount:
             return Cause.CONNECTION_CLOSED, self._connection_error
         if self.control_error:
             return Cause.CONTROL_FAILED, self.control_error
-        if self.release_reason:
-            return Cause.RELEASED, self.release_reason
+        if self.breach_reason:
+            return Cause.ENVELOPE, self.breach_reason
         cause = self._cause
         if cause is None and self._state is HandoverState.ENGAGED and is_silent(self._now_ns, self._vehicle):
             return Cause.VEHICLE_SILENT, ""

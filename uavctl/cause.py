@@ -40,7 +40,7 @@ class Cause(StrEnum):
     STAMPS_UNUSABLE = "stamps-unusable"
     RELAY_SILENT = "relay-silent"
     SILENCE = "silence"
-    RELEASED = "let-go"
+    ENVELOPE = "let-go"
     NOT_AS_ORDERED = "not-as-ordered"
     BEGIN_REFUSED = "begin-refused"
     NOT_RISEN = "not-risen"
@@ -153,7 +153,7 @@ CAUSES: dict[Cause, CauseText] = {
     _C.STAMPS_UNUSABLE: CauseText(_R.POSITIONS, BAD, "Time stamps unusable"),
     _C.RELAY_SILENT: CauseText(_R.POSITIONS, BAD, "Relay silent"),
     _C.SILENCE: CauseText(_R.POSITIONS, CAUTION, "No positions for a while"),
-    _C.RELEASED: CauseText(_R.ENDING, BAD, "Let go", "let go by the envelope"),
+    _C.ENVELOPE: CauseText(_R.ENDING, BAD, "Let go", "let go by the envelope"),
     _C.NOT_AS_ORDERED: CauseText(_R.ENDING, BAD, "Not as ordered"),
     _C.BEGIN_REFUSED: CauseText(_R.ENDING, BAD, "Refused by the vehicle"),
     _C.NOT_RISEN: CauseText(

@@ -208,9 +208,9 @@ class ControlLoop:
         return self._hand_over.failure
 
     @property
-    def release_reason(self) -> str:
+    def breach_reason(self) -> str:
         """Reason why a monitor has released the vehicle; empty while none has."""
-        return "" if self._state.monitors.release is None else self._state.monitors.release.text
+        return "" if self._state.monitors.breach is None else self._state.monitors.breach.text
 
     @property
     def handover_state(self) -> HandoverState:
@@ -276,7 +276,7 @@ class ControlLoop:
         step_ns = self._stopwatch() - begin_ns
         self._decision = output.decision
         self._record_output(output, at_ns)
-        self.account.release_reason = self.release_reason
+        self.account.breach_reason = self.breach_reason
         self.account.update_vehicle(at_ns, self._vehicle)
         self.account.add_decision(output.decision, output.events, has_estimate=output.estimate is not None)
         self._relay_positions(inputs, output, send, notices)

@@ -18,7 +18,7 @@ from logs.recording.notes import NoteKind, RecorderNote
 from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.event_codes import MISSION, EventCode
-from uavctl.flight.supervise import RELEASES
+from uavctl.flight.supervise import ENVELOPE_CODES
 from uavctl.records import (
     Checked,
     ControlMode,
@@ -136,7 +136,7 @@ class FlightData:
     @cached_property
     def breach(self) -> Event | None:
         """Return the envelope's event on an impossible observation, for which the vehicle was let go; else None."""
-        return next((event for event in self.events if event.code in RELEASES), None)
+        return next((event for event in self.events if event.code in ENVELOPE_CODES), None)
 
     @cached_property
     def landing(self) -> Landing | None:

@@ -44,7 +44,7 @@ def find_ending(flight: FlightData) -> Ending:
 def _find_cause(flight: FlightData) -> Cause:
     modes = [decision.mode for decision in flight.flown]
     if flight.breach is not None:
-        return Cause.RELEASED
+        return Cause.ENVELOPE
     if ControlMode.LAND in modes:  # for one tick; nobody flies after it
         if flight.landing is None:
             return Cause.FALLBACK_LANDED

@@ -74,7 +74,7 @@ def derive_headline_of_file(path: Path) -> Headline | None:
 
 _END_CAUSES = frozenset(
     {
-        Cause.RELEASED,
+        Cause.ENVELOPE,
         Cause.NOT_AS_ORDERED,
         Cause.NOT_FLOWN,
         Cause.VEHICLE_SILENT,

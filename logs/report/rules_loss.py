@@ -15,7 +15,7 @@ from logs.report.excursion import GRAVE_M, Excursion
 from logs.report.findings import Finding, metres, seconds
 from uavctl.cause import Cause
 from uavctl.event_codes import EventCode
-from uavctl.flight.supervise import OF_POSITIONS
+from uavctl.flight.supervise import POSITION_CODES
 from uavctl.mavlink.connection import DISCONNECT_TEXTS, VEHICLE
 from uavctl.records import ControlMode, number
 
@@ -41,7 +41,7 @@ def describe_source(e: FlightEvidence, at_s: float) -> str:
     if e.flight.truths:
         return ""
     breach = e.flight.breach
-    is_doubted = breach is not None and breach.code in OF_POSITIONS and at_s >= e.breach_s
+    is_doubted = breach is not None and breach.code in POSITION_CODES and at_s >= e.breach_s
     source = "positions that were no longer believed" if is_doubted else "the estimate"
     return f" (by {source}: the true state is unknown)"
 

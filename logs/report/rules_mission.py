@@ -56,7 +56,7 @@ def find_bad_ending(e: FlightEvidence) -> Iterator[Finding]:
         at_s = _find_release_s(e)
         time_text = "" if at_s is None else f" at {seconds(at_s)}"
         if flight.breach is not None:
-            yield Finding(Cause.RELEASED, at_s or 0.0, f"by the envelope{time_text}: {flight.breach.text}")
+            yield Finding(Cause.ENVELOPE, at_s or 0.0, f"by the envelope{time_text}: {flight.breach.text}")
         else:
             cause_text = (
                 s.ending.cause

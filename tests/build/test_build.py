@@ -9,8 +9,8 @@ from uavctl.build.controller import build_controller, build_design, build_plant,
 from uavctl.config import load_config, presets
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 
 
 def test_the_paper_s_plant_is_as_printed() -> None:

@@ -245,5 +245,5 @@ def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
     flight.start()
     wait_until(lambda: not flight.is_running(), "the end of the daemon")
     flight.join_output()
-    flight.request_end()
+    flight.request_fallback()
     assert flight.exit_code == 1

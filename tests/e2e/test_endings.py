@@ -343,7 +343,7 @@ def test_it_disarms_in_flight(tmp_path: Path, run_flight: RunFlight) -> None:
 @pytest.mark.slow
 def test_the_envelope_lets_it_go(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "target.position_m=[2.0,1.0,-1.2]", peers=("frame.yaw_deg=90.0",))
-    report = run_flight(rig, Cause.RELEASED, *TAKE_OFF)
+    report = run_flight(rig, Cause.ENVELOPE, *TAKE_OFF)
     assert report.summary["let_go"] and report.summary["let_go"] in report.ending["sentence"]
 
 

@@ -157,7 +157,7 @@ def test_one_that_flies_at_a_wall_is_braked_while_it_can_be(
     # The envelope may have its say while it brakes.
     assert (
         observed.ending is not None
-        and observed.ending.code in (Cause.FALLBACK_LANDED, Cause.RELEASED)
+        and observed.ending.code in (Cause.FALLBACK_LANDED, Cause.ENVELOPE)
         and observed.ending.exit_code == 1
     )
     assert ControlMode.BRAKE in observed.modes and ControlMode.HOLD in observed.modes

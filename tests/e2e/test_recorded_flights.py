@@ -522,7 +522,7 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
 
     # What the console, the exit code and the page say of it: the reason is the envelope's own.
     (reason,) = [event.text for event in received.memory.of(Event) if event.code == "envelope-response"]
-    assert received.loop.release_reason == reason and reason in received.loop.ending.sentence
+    assert received.loop.breach_reason == reason and reason in received.loop.ending.sentence
     assert received.loop.ending.exit_code == 1
     assert [notice.text for notice in received.notices if "engaged -> landing" in notice.text]
     assert reason in " ".join(read_page_text(make_page_data(received.memory)).text)
@@ -538,7 +538,7 @@ def test_before_the_wind_the_same_flight_has_no_finding() -> None:
     """In 25 s of hovering, and from the blackout's end to the order of the wind."""
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
         received = listen(BLOWN, since_s, seconds)
-        assert not received.loop.release_reason and not received.notices
+        assert not received.loop.breach_reason and not received.notices
         assert not [code for code in list_codes(received.memory) if code.startswith(("envelope", "fallback"))]
 
 

@@ -18,7 +18,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState, update
 from uavctl.flight.monitors.observation import Observation
-from uavctl.flight.supervise import OF_POSITIONS, RELEASES
+from uavctl.flight.supervise import ENVELOPE_CODES, POSITION_CODES
 from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.lab.trial import TrackedFlyer, compute_excess_m, get_cached_controller, get_room_limits
 from uavctl.loop import VEHICLE, ControlLoop, make_links
@@ -109,7 +109,7 @@ def fly_in_wind(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3,
     goals = (config.target.position_m, *config.mission.waypoints)
     off = np.linalg.norm(where - np.array(goals[-1]), axis=1)
     lower, upper = get_room_limits(config)
-    let_go = [event.at_ns * 1e-9 for event in events.events if event.code in RELEASES]
+    let_go = [event.at_ns * 1e-9 for event in events.events if event.code in ENVELOPE_CODES]
     return WindResult(
         codes=[event.code for event in events.events],
         from_target_m=float(off[times > over_s - 1.0].max()),
@@ -136,7 +136,7 @@ def fly_in_wind(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3,
 @pytest.mark.fault(71)
 def test_a_wind_that_the_vehicle_can_hold_is_held(autopilot: str, push_mps2: Vec3) -> None:
     flight = fly_in_wind(autopilot, push_mps2)
-    assert flight.let_go_s is None and not RELEASES & set(flight.codes)
+    assert flight.let_go_s is None and not ENVELOPE_CODES & set(flight.codes)
     assert flight.from_target_m < NEAR_M and flight.worst_m < 1.0
     assert max(flight.relayed_s) > OVER_S - 0.5
 
@@ -148,7 +148,7 @@ def test_a_wind_that_the_vehicle_can_hold_is_held(autopilot: str, push_mps2: Vec
 def test_a_wind_that_it_cannot_hold_lets_it_land_by_its_positions(autopilot: str) -> None:
     flight = fly_in_wind(autopilot, (6.0, 0.0, 0.0))
     assert flight.let_go_s is not None and set(flight.codes) & {EventCode.OUTSIDE, EventCode.BRAKING}
-    assert not OF_POSITIONS & set(flight.codes) and EventCode.STRONG_PUSH in flight.codes
+    assert not POSITION_CODES & set(flight.codes) and EventCode.STRONG_PUSH in flight.codes
     after = [at_s for at_s in flight.relayed_s if flight.let_go_s < at_s < flight.let_go_s + 3.0]
     assert len(after) > 20 and max(np.diff([flight.let_go_s, *after])) < 1.0
 

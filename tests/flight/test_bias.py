@@ -273,9 +273,9 @@ def test_what_positions_that_are_taken_back_told_of_it_is_forgotten() -> None:
         state, output = run_tick(
             state, StepInput(tick=n, at_ns=at_ns, samples=(said,), vehicle=vehicle(), motion=own), controller
         )
-        if state.monitors.release is not None:
+        if state.monitors.breach is not None:
             break
-    assert state.monitors.release is not None and n > lies + TICKS
+    assert state.monitors.breach is not None and n > lies + TICKS
     clean_ns = state.monitors.engaged.consistent_ns
     assert clean_ns is not None and lies * TICK_NS <= clean_ns - START_NS < n * TICK_NS
     assert any(at_ns > clean_ns for at_ns, _ in before.fallback.biases)

@@ -43,7 +43,7 @@ from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity
-from uavctl.flight.supervise import RELEASES
+from uavctl.flight.supervise import ENVELOPE_CODES
 from uavctl.records import Vec3, VehicleMotion
 
 # The observer
@@ -612,6 +612,6 @@ def test_what_time_it_is_makes_no_difference() -> None:
             at_ns += int(rng.choice([int(rng.integers(30, 90)), 400, 3500], p=[0.96, 0.03, 0.01])) * MS
     assert (
         found
-        == RELEASES
+        == ENVELOPE_CODES
         == {EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER, EventCode.OUTSIDE, EventCode.BRAKING}
     )

@@ -35,7 +35,7 @@ def test_three_late_answers_in_a_row_or_one_far_too_late_release_the_vehicle(
     for n, one_ns in enumerate(took_ns):
         state, verdict = update(state, AnswerObservation("ours", one_ns, TICK_NS))
         if not verdict.is_none:
-            assert (verdict.action, verdict.cause) == (Action.RELEASE, EventCode.CONTROLLER_LATE)
+            assert (verdict.action, verdict.cause) == (Action.END_PLANS, EventCode.CONTROLLER_LATE)
             assert state.fault == verdict.text
             released.append(n)
     assert released == ([] if released_at is None else [released_at])
@@ -63,7 +63,7 @@ def along(axis: int, value: float, others: Vec3 = ZERO) -> Vec3:
 
 def is_released(position_m: Vec3, velocity_mps: Vec3, sent_mps2: Vec3) -> bool:
     verdict = judge_wall(WallObservation("ours", position_m, velocity_mps, sent_mps2, BOUNDS, LIMITS, FALLBACK))
-    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.RELEASE, EventCode.CONTROLLER_WALL)
+    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.END_PLANS, EventCode.CONTROLLER_WALL)
     return not verdict.is_none
 
 

@@ -10,14 +10,14 @@ import pytest
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
 from uavctl.flight.fallback import (
     Fallback,
-    FallbackEnd,
     FallbackParameters,
+    FallbackReason,
     advance_fallback,
     begin_fallback,
     compute_brake_accel,
     compute_return_accel,
     compute_stop_m,
-    request_end,
+    request_fallback,
 )
 from uavctl.flight.limits import ZERO
 from uavctl.records import ControlMode, Vec3
@@ -29,18 +29,18 @@ PARAMETERS = FallbackParameters(
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, RELEASED, STOP, TO_LAND = (
-    FallbackEnd.RECOVER,
-    FallbackEnd.CONTROLLER_FAILED,
-    FallbackEnd.POSITIONS_DISTRUSTED,
-    FallbackEnd.RELEASED,
-    FallbackEnd.STOP,
-    FallbackEnd.LAND,
+RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, ENVELOPE, STOP, TO_LAND = (
+    FallbackReason.RECOVER,
+    FallbackReason.CONTROLLER_FAILED,
+    FallbackReason.POSITIONS_DISTRUSTED,
+    FallbackReason.ENVELOPE,
+    FallbackReason.STOP,
+    FallbackReason.LAND,
 )
 
 
 @pytest.mark.parametrize(
-    ("mode", "end", "after_ns", "speed_mps", "parameters", "wanted"),
+    ("mode", "reason", "after_ns", "speed_mps", "parameters", "wanted"),
     [
         (BRAKE, RECOVER, 0, FAST, PARAMETERS, BRAKE),
         (BRAKE, RECOVER, 2 * S - 1, FAST, PARAMETERS, BRAKE),
@@ -68,8 +68,8 @@ RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, RELEASED, STOP, TO_LAND = (
         (HOLD, CONTROLLER_FAILED, 0, FAST, PARAMETERS, LAND),
         (HOLD, CONTROLLER_FAILED, 99 * S, FAST, STAY, STOPPED),
         (HOLD, POSITIONS_DISTRUSTED, 99 * S, FAST, STAY, STOPPED),  # nothing that we left in the air is left to drift
-        (HOLD, RELEASED, 0, FAST, PARAMETERS, LAND),
-        (HOLD, RELEASED, 0, FAST, STAY, STOPPED),
+        (HOLD, ENVELOPE, 0, FAST, PARAMETERS, LAND),
+        (HOLD, ENVELOPE, 0, FAST, STAY, STOPPED),
         (BRAKE, TO_LAND, 2 * S - 1, FAST, STAY, BRAKE),
         (BRAKE, TO_LAND, 2 * S, FAST, STAY, HOLD),
         (HOLD, TO_LAND, 0, FAST, PARAMETERS, LAND),
@@ -82,21 +82,21 @@ RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, RELEASED, STOP, TO_LAND = (
 )
 def test_transitions(
     mode: ControlMode,
-    end: FallbackEnd,
+    reason: FallbackReason,
     after_ns: int,
     speed_mps: float,
     parameters: FallbackParameters,
     wanted: ControlMode,
 ) -> None:
-    before = Fallback(mode=mode, since_ns=5 * S, end=end)
+    before = Fallback(mode=mode, since_ns=5 * S, reason=reason)
     after = advance_fallback(before, 5 * S + after_ns, speed_mps, ZERO, parameters)
     assert after.mode is wanted
-    assert after.end is end
+    assert after.reason is reason
     assert after.since_ns == (5 * S if wanted is mode else 5 * S + after_ns)
 
 
 @pytest.mark.parametrize(
-    ("end", "after_ns", "sent_mps2", "wanted"),
+    ("reason", "after_ns", "sent_mps2", "wanted"),
     [
         (STOP, S // 20, (0.0, 0.0, -0.25), HOLD),  # the last gate has not let the zero through yet
         (STOP, S // 20, (0.0, 0.0, 0.0), LAND),
@@ -106,13 +106,15 @@ def test_transitions(
         (RECOVER, S, (0.0, 0.0, 0.0), HOLD),
     ],
 )
-def test_a_hand_over_waits_for_its_zero(end: FallbackEnd, after_ns: int, sent_mps2: Vec3, wanted: ControlMode) -> None:
-    before = Fallback(mode=HOLD, since_ns=5 * S, end=end)
+def test_a_hand_over_waits_for_its_zero(
+    reason: FallbackReason, after_ns: int, sent_mps2: Vec3, wanted: ControlMode
+) -> None:
+    before = Fallback(mode=HOLD, since_ns=5 * S, reason=reason)
     assert advance_fallback(before, 5 * S + after_ns, 0.0, sent_mps2, PARAMETERS).mode is wanted
 
 
 def test_begins_with_braking() -> None:
-    assert begin_fallback(7) == Fallback(mode=BRAKE, since_ns=7, end=RECOVER)
+    assert begin_fallback(7) == Fallback(mode=BRAKE, since_ns=7, reason=RECOVER)
 
 
 def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
@@ -143,7 +145,7 @@ def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Ve
 
 
 @pytest.mark.parametrize(
-    ("before", "end", "after"),
+    ("before", "reason", "after"),
     [
         (None, STOP, Fallback(BRAKE, 9, STOP)),
         (Fallback(BRAKE, 4), STOP, Fallback(BRAKE, 4, STOP)),  # the time of braking is not prolonged
@@ -158,24 +160,24 @@ def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Ve
         (Fallback(BRAKE, 4, TO_LAND), STOP, Fallback(BRAKE, 4, TO_LAND)),  # nobody takes a landing back
         (Fallback(BRAKE, 4, STOP), POSITIONS_DISTRUSTED, Fallback(BRAKE, 4, STOP)),
         (Fallback(BRAKE, 4, POSITIONS_DISTRUSTED), TO_LAND, Fallback(BRAKE, 4, TO_LAND)),
-        (None, RELEASED, Fallback(HOLD, 9, RELEASED)),  # nothing is braked on
-        (Fallback(BRAKE, 4, POSITIONS_DISTRUSTED), RELEASED, Fallback(HOLD, 9, RELEASED)),
-        (Fallback(BRAKE, 4, STOP), RELEASED, Fallback(BRAKE, 4, STOP)),
-        (Fallback(HOLD, 4, RELEASED), TO_LAND, Fallback(HOLD, 4, TO_LAND)),
+        (None, ENVELOPE, Fallback(HOLD, 9, ENVELOPE)),  # nothing is braked on
+        (Fallback(BRAKE, 4, POSITIONS_DISTRUSTED), ENVELOPE, Fallback(HOLD, 9, ENVELOPE)),
+        (Fallback(BRAKE, 4, STOP), ENVELOPE, Fallback(BRAKE, 4, STOP)),
+        (Fallback(HOLD, 4, ENVELOPE), TO_LAND, Fallback(HOLD, 4, TO_LAND)),
         (Fallback(LAND, 4), TO_LAND, Fallback(LAND, 4)),
         (Fallback(STOPPED, 4), STOP, Fallback(STOPPED, 4)),
     ],
 )
-def test_an_end_that_is_asked_for(before: Fallback | None, end: FallbackEnd, after: Fallback) -> None:
-    assert request_end(before, end, 9) == after
+def test_an_end_that_is_asked_for(before: Fallback | None, reason: FallbackReason, after: Fallback) -> None:
+    assert request_fallback(before, reason, 9) == after
 
 
 def test_there_is_a_way_back_from_one_end_only() -> None:
-    assert [Fallback(HOLD, 0, end).final for end in FallbackEnd] == [False, True, True, True, True, True]
+    assert [Fallback(HOLD, 0, reason).is_final for reason in FallbackReason] == [False, True, True, True, True, True]
 
 
 def test_what_has_been_handed_over_has_ended() -> None:
-    assert [Fallback(mode, 0).ended for mode in (BRAKE, HOLD, LAND, STOPPED)] == [False, False, True, True]
+    assert [Fallback(mode, 0).is_over for mode in (BRAKE, HOLD, LAND, STOPPED)] == [False, False, True, True]
 
 
 @pytest.mark.parametrize(
@@ -227,7 +229,7 @@ def test_a_time_to_hold_that_ends_while_it_brakes_again_begins_no_braking_anew()
 
 
 @pytest.mark.parametrize(
-    ("end", "measured", "speed_mps", "wanted"),
+    ("reason", "measured", "speed_mps", "wanted"),
     [
         (RECOVER, True, 0.151, BRAKE),
         (RECOVER, True, 0.15, HOLD),
@@ -237,13 +239,13 @@ def test_a_time_to_hold_that_ends_while_it_brakes_again_begins_no_braking_anew()
     ],
 )
 def test_what_drifts_by_its_own_word_is_braked_again(
-    end: FallbackEnd, measured: bool, speed_mps: float, wanted: ControlMode
+    reason: FallbackReason, measured: bool, speed_mps: float, wanted: ControlMode
 ) -> None:
-    before = Fallback(mode=HOLD, since_ns=5 * S, end=end, held_ns=4 * S)
+    before = Fallback(mode=HOLD, since_ns=5 * S, reason=reason, held_ns=4 * S)
     after = advance_fallback(
         before, 6 * S, speed_mps, (1.0, 0.0, 0.0), replace(PARAMETERS, hold_s=9.0, blind_hold_s=9.0), measured=measured
     )
-    if end is STOP:
+    if reason is STOP:
         assert after.mode is LAND  # its second for the zero is over
     else:
         assert (after.mode, after.held_ns) == (wanted, 4 * S)

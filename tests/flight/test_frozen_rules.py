@@ -13,13 +13,13 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import absorb_samples, begin_history, note_input
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.monitors.frozen import (
-    MovedNs,
+    LastMotionNs,
     PredictedSample,
-    SourceRecord,
-    SourceRecords,
+    SourceTrack,
+    SourceTracks,
     is_frozen,
     is_suspect,
-    record_sample,
+    track_sample,
     update,
 )
 from uavctl.flight.monitors.outliers import GateParameters
@@ -30,14 +30,14 @@ PLANT = small_plant()
 KALMAN = make_kalman(PLANT, estimator_parameters(), DT_NS)
 
 
-def watched(values: list[float], source: str = "camera", watches: SourceRecords | None = None) -> SourceRecords:
+def watched(values: list[float], source: str = "camera", watches: SourceTracks | None = None) -> SourceTracks:
     """What is known of a source after these values, one each 50 ms, with what was off as 1 mm."""
     watches = watches or {}
     history = begin_history(KALMAN, START_NS, START_NS)
     for n, value in enumerate(values):
         one = sample(START_NS + (n + 1) * TICK_NS, position_m=(value, 0.0, 0.0), source=source)
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, ())
-        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
+        watches = track_sample(watches, KALMAN, history, one, np.array([0.001]))
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
         history = note_input(history, one.received_ns, np.array([1.0]))
     return watches
@@ -60,10 +60,10 @@ def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_
 
 def test_the_smallest_change_of_any_axis_shows_the_resolution() -> None:
     history = begin_history(KALMAN, START_NS, START_NS)
-    records = record_sample({}, KALMAN, history, sample(START_NS), np.array([0.001]))
+    records = track_sample({}, KALMAN, history, sample(START_NS), np.array([0.001]))
     assert (records["camera"].axis_repeats, records["camera"].gap_ns) == ((0, 0, 0), 0)
     moved = sample(START_NS + TICK_NS, position_m=(0.5, 0.25, 0.0))
-    assert record_sample(records, KALMAN, history, moved, np.array([0.001]))["camera"].resolution_m == 0.25
+    assert track_sample(records, KALMAN, history, moved, np.array([0.001]))["camera"].resolution_m == 0.25
 
 
 def test_coasting_goes_by_the_inputs_alone() -> None:
@@ -87,11 +87,11 @@ def test_sources_are_watched_apart() -> None:
 def test_late_samples_say_nothing(late_ns: int) -> None:
     watches, history = watched([0.0, 0.5, 0.25]), begin_history(KALMAN, START_NS, START_NS)
     late = sample(START_NS + 3 * TICK_NS - late_ns, position_m=(0.25, 0.0, 0.0))
-    assert record_sample(watches, KALMAN, history, late, np.zeros(1)) is watches
+    assert track_sample(watches, KALMAN, history, late, np.zeros(1)) is watches
 
 
 def test_eight_sources_are_watched_and_many_names_do_not_fill_the_memory() -> None:
-    watches: SourceRecords = {}
+    watches: SourceTracks = {}
     for n in range(8):
         watches = watched([0.0], f"s{n}", watches)
     assert set(watches) == {f"s{n}" for n in range(8)}
@@ -105,19 +105,19 @@ def test_eight_sources_are_watched_and_many_names_do_not_fill_the_memory() -> No
 
 def test_each_axis_is_watched_for_moves_and_repeats_of_its_own() -> None:
     """The north moves and the down but twice; the east never does."""
-    watches: SourceRecords = {}
+    watches: SourceTracks = {}
     history = begin_history(KALMAN, START_NS, START_NS)
     values = [(0.0, 1.0, 5.0), (0.1, 1.0, 5.0), (0.3, 1.0, 6.0), (0.3, 1.0, 6.0), (0.4, 1.0, 7.0), (0.6, 1.0, 7.0)]
     for n, value in enumerate(values):
         one = sample(START_NS + (n + 1) * TICK_NS, position_m=value)
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
-        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
+        watches = track_sample(watches, KALMAN, history, one, np.array([0.001]))
     watch = watches["camera"]
     assert (watch.axis_changes, watch.axis_repeats) == ((4, 0, 2), (0, 5, 1))
     assert watch.axis_first_ns == (START_NS + 6 * TICK_NS, START_NS + TICK_NS, START_NS + 5 * TICK_NS)
     for n in range(20):
         one = sample(START_NS + (n + 9) * TICK_NS, position_m=(0.1 * (n % 2), 1.0, 7.0))
-        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
+        watches = track_sample(watches, KALMAN, history, one, np.array([0.001]))
     assert (watches["camera"].axis_changes, watches["camera"].axis_repeats) == ((10, 0, 2), (0, 25, 21))
 
 
@@ -137,23 +137,23 @@ def test_each_axis_is_watched_for_moves_and_repeats_of_its_own() -> None:
 def test_an_axis_that_noise_has_moved_and_that_stands_still_is_stuck(
     moves: tuple[int, ...], still: tuple[int, ...], noise_m: float, since: int | None
 ) -> None:
-    watch = SourceRecord(
+    watch = SourceTrack(
         START_NS, (0.0, 0.0, 0.0), 0.001, noise_m, axis_changes=moves, axis_repeats=still, axis_first_ns=(1, 2, 3)
     )
     assert watch.find_frozen_axis_ns(ALWAYS) == since
     assert is_frozen(watch, KALMAN, sample(START_NS), PARAMETERS, ALWAYS) is (since is not None)
 
 
-ALWAYS: MovedNs = (2**62,) * 3  # it moves all the time
+ALWAYS: LastMotionNs = (2**62,) * 3  # it moves all the time
 
 
 @pytest.mark.parametrize(
     ("moved_ns", "since"), [((1, 2, 3), 1), ((0, 2, 3), 3), ((0, 9, 2), None), ((0, 0, 9), 3), ((9, 0, 0), 1)]
 )
 def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(
-    moved_ns: MovedNs, since: int | None
+    moved_ns: LastMotionNs, since: int | None
 ) -> None:
-    watch = SourceRecord(
+    watch = SourceTrack(
         START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, axis_changes=(10,) * 3, axis_repeats=(5, 0, 5), axis_first_ns=(1, 2, 3)
     )
     assert watch.find_frozen_axis_ns(moved_ns) == since
@@ -164,13 +164,13 @@ def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(
     ("moved_ns", "rests"),
     [((6, 6, 6), True), ((7, 6, 6), False), ((6, 7, 6), False), ((6, 6, 7), False), ((9, 6, 6), False)],
 )
-def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: MovedNs, rests: bool) -> None:
-    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0), 5e-5, first_ns=7)
+def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: LastMotionNs, rests: bool) -> None:
+    watch = SourceTrack(START_NS, (0.0, 0.0, 0.0), 5e-5, first_ns=7)
     assert watch.may_rest(moved_ns) == rests
     assert replace(watch, resolution_m=1e-3).may_rest(moved_ns) == rests
     assert not replace(watch, resolution_m=4.99e-5).may_rest(moved_ns)  # noise to the last digit does not say it twice
     assert not replace(watch, is_known_frozen=True).may_rest(moved_ns)
-    assert not replace(watch, was_suspect=True).may_rest(moved_ns)
+    assert not replace(watch, is_known_suspect=True).may_rest(moved_ns)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: MovedNs
     [(10, 0.01, 0.01), (9, 0.01, 0.002), (9, 0.001, 0.001), (11, 0.01, 0.01), (0, 0.0, 0.0)],
 )
 def test_a_few_changes_do_not_tell_the_resolution(changes: int, resolution_m: float, grain_m: float) -> None:
-    assert SourceRecord(START_NS, (0.0, 0.0, 0.0), resolution_m, changes=changes).limited_resolution_m == grain_m
+    assert SourceTrack(START_NS, (0.0, 0.0, 0.0), resolution_m, changes=changes).limited_resolution_m == grain_m
 
 
 @pytest.mark.parametrize(
@@ -211,7 +211,7 @@ def test_what_counts_as_stuck(
         mean=np.array([2.0 + far_m, 9.0, 9.0, 9.0]),
         cov=np.diag([std_m**2, 9, 9, 9]),
     )
-    watch = SourceRecord(
+    watch = SourceTrack(
         START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=repeats, open_loop_belief=belief
     )
     assert is_frozen(watch, KALMAN, one, PARAMETERS, ALWAYS) is found
@@ -243,7 +243,7 @@ def test_when_a_value_that_came_again_is_not_believed(
     for std_m in (0.0, 5.0):
         mean, cov = np.array([2.0 + far_m, 9.0, 9.0, 9.0]), np.eye(4) * std_m**2
         belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=mean, cov=cov)
-        watch = SourceRecord(
+        watch = SourceTrack(
             START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=1, open_loop_belief=belief
         )
         assert is_suspect(watch, KALMAN, one, PARAMETERS) is suspect
@@ -255,7 +255,7 @@ def test_what_is_near_enough_is_so_at_the_edge_as_well() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     for north_m, suspect in ((2.125, False), (math.nextafter(2.125, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = SourceRecord(
+        watch = SourceTrack(
             START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, open_loop_belief=belief
         )
         assert is_suspect(watch, KALMAN, one, parameters) is suspect
@@ -266,20 +266,20 @@ def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     for north_m, found in ((2.25, False), (math.nextafter(2.25, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = SourceRecord(
+        watch = SourceTrack(
             START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, open_loop_belief=belief
         )
         assert is_frozen(watch, KALMAN, one, parameters, ALWAYS) is found
 
 
 def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> None:
-    watches: SourceRecords = {}
+    watches: SourceTracks = {}
     history = begin_history(KALMAN, START_NS, START_NS)
     seen = []
     for ticks, value in ((1, 0.0), (4, 0.5), (6, 0.7), (9, 0.7), (10, 0.7), (14, 0.9)):
         one = sample(START_NS + ticks * TICK_NS, position_m=(value, 0.0, 0.0))
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
-        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
+        watches = track_sample(watches, KALMAN, history, one, np.array([0.001]))
         seen.append((watches["camera"].gap_ns // TICK_NS, watches["camera"].spacing_ns // TICK_NS))
     assert seen == [(0, 0), (3, 3), (2, 2), (2, 2), (2, 1), (4, 1)]
 
@@ -298,9 +298,7 @@ def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> No
 def test_the_value_that_first_came_may_be_stale_where_one_was_lost_before(
     changes: int, repeats: int, gap_ns: int, stale: bool
 ) -> None:
-    watch = SourceRecord(
-        9, (0.0, 0.0, 0.0), changes=changes, repeats=repeats, first_ns=7, gap_ns=gap_ns, spacing_ns=100
-    )
+    watch = SourceTrack(9, (0.0, 0.0, 0.0), changes=changes, repeats=repeats, first_ns=7, gap_ns=gap_ns, spacing_ns=100)
     assert watch.repeated_since_ns == (7 if stale else 8)
 
 
@@ -329,14 +327,14 @@ def test_the_part_of_values_that_come_again_is_learnt_of_one_repeat_or_two() -> 
     ],
 )
 def test_what_a_source_does_as_usual(usual: float, repeats: int, as_usual: bool, unlike_it: bool) -> None:
-    watch = SourceRecord(9, (0.0, 0.0, 0.0), repeated_share=usual, repeats=repeats)
+    watch = SourceTrack(9, (0.0, 0.0, 0.0), repeated_share=usual, repeats=repeats)
     assert (watch.repeats_regularly, watch.has_just_begun_to_repeat) == (as_usual, unlike_it)
 
 
 def test_a_source_that_says_values_twice_is_not_stuck_for_it_however_far_the_vehicle_flew() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(START_NS, START_NS, mean=np.array([3.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-    watch = SourceRecord(START_NS, one.position_m, repeats=2, repeated_share=1.0, open_loop_belief=belief)
+    watch = SourceTrack(START_NS, one.position_m, repeats=2, repeated_share=1.0, open_loop_belief=belief)
     assert is_frozen(watch, KALMAN, one, PARAMETERS, ALWAYS) is False
     assert is_suspect(watch, KALMAN, one, PARAMETERS) is True
     assert is_frozen(replace(watch, repeats=3), KALMAN, one, PARAMETERS, ALWAYS) is True
@@ -348,15 +346,15 @@ def test_news_is_a_mean_of_which_the_first_values_are_equal_parts() -> None:
     means = []
     for n, off_m in enumerate((0.001, 0.004, 0.001)):
         one = sample(START_NS + (n + 2) * TICK_NS, position_m=(0.5 + 0.1 * n, 0.0, 0.0))
-        watches = record_sample(watches, KALMAN, history, one, np.array([-off_m]))
+        watches = track_sample(watches, KALMAN, history, one, np.array([-off_m]))
         means.append(watches["camera"].noise_m)
     assert means == pytest.approx([0.001, 0.0025, 0.002])
 
 
 def test_the_time_between_two_values_does_not_go_by_when_it_was() -> None:
     history = begin_history(KALMAN, 0, 0)
-    watches = record_sample({}, KALMAN, history, sample(10), np.array([0.001]))
-    watches = record_sample(watches, KALMAN, history, sample(50, position_m=(1.0, 0.0, 0.0)), np.array([0.001]))
+    watches = track_sample({}, KALMAN, history, sample(10), np.array([0.001]))
+    watches = track_sample(watches, KALMAN, history, sample(50, position_m=(1.0, 0.0, 0.0)), np.array([0.001]))
     assert (watches["camera"].gap_ns, watches["camera"].spacing_ns) == (40, 40)
 
 
@@ -374,16 +372,16 @@ def test_its_axes_do_not_stand_still_for_it() -> None:
 def test_a_value_that_was_taken_back_is_not_believed_until_another_comes() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(START_NS, START_NS, mean=np.array([2.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-    watch = SourceRecord(START_NS, one.position_m, repeats=1, open_loop_belief=belief)
+    watch = SourceTrack(START_NS, one.position_m, repeats=1, open_loop_belief=belief)
     assert is_suspect(watch, KALMAN, one, PARAMETERS) is False
-    assert is_suspect(replace(watch, was_suspect=True), KALMAN, one, PARAMETERS) is True
-    assert is_suspect(replace(watch, was_suspect=True, open_loop_belief=None), KALMAN, one, PARAMETERS) is True
-    told = {"camera": replace(watch, was_suspect=True, at_ns=START_NS)}
+    assert is_suspect(replace(watch, is_known_suspect=True), KALMAN, one, PARAMETERS) is True
+    assert is_suspect(replace(watch, is_known_suspect=True, open_loop_belief=None), KALMAN, one, PARAMETERS) is True
+    told = {"camera": replace(watch, is_known_suspect=True, at_ns=START_NS)}
     history = begin_history(KALMAN, START_NS, START_NS)
     again = sample(START_NS + 1, position_m=(2.0, 0.0, 0.0))
-    assert record_sample(told, KALMAN, history, again, np.zeros(1))["camera"].was_suspect
+    assert track_sample(told, KALMAN, history, again, np.zeros(1))["camera"].is_known_suspect
     other = sample(START_NS + 1, position_m=(2.1, 0.0, 0.0))
-    assert not record_sample(told, KALMAN, history, other, np.zeros(1))["camera"].was_suspect
+    assert not track_sample(told, KALMAN, history, other, np.zeros(1))["camera"].is_known_suspect
 
 
 def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_too() -> None:
@@ -397,7 +395,7 @@ def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_to
     history, _, _ = absorb_samples(KALMAN, history, late_ns, ())
     assert history.window_begin_ns > one.captured_ns
     late = sample(late_ns, position_m=(0.5, 0.0, 0.0))
-    watch = record_sample(watches, KALMAN, history, late, np.zeros(1))["camera"]
+    watch = track_sample(watches, KALMAN, history, late, np.zeros(1))["camera"]
     assert watch.open_loop_belief is not None
     assert watch.open_loop_belief.at_ns == late_ns
     assert is_suspect(watch, KALMAN, late, PARAMETERS)
@@ -413,7 +411,7 @@ def judged(
         next_m: Value of the last sample.
     """
     values = [0.0, 0.01, *[0.02] * len(inputs_mps2), next_m]
-    records: SourceRecords = {}
+    records: SourceTracks = {}
     history, found = begin_history(KALMAN, START_NS, START_NS), []
     for n, (value, accel_mps2) in enumerate(zip(values, [0.0, 0.0, 0.0, *inputs_mps2], strict=True)):
         at_ns = START_NS + (n + 1) * TICK_NS

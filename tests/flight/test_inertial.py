@@ -50,7 +50,7 @@ from uavctl.flight.estimator import (
     predict_belief,
     update_inertial,
 )
-from uavctl.flight.fallback import Fallback, FallbackEnd
+from uavctl.flight.fallback import Fallback, FallbackReason
 from uavctl.flight.kalman import (
     DRIFT_WITHOUT_INERTIAL,
     INERTIAL_LASTS_NS,
@@ -494,7 +494,7 @@ def test_a_fallback_that_ends_holds_by_nothing() -> None:
     history = update_inertial(kalman, history, felt_at(START_NS + MS, 0.3))
     given = StepInput(tick=1, at_ns=START_NS + TICK_NS, vehicle=vehicle())
     view = view_filter(history, locate_on_grid(ControlState(), given, controller, is_climbing_or_landing=False))
-    ended, origin = Fallback(ControlMode.HOLD, START_NS, FallbackEnd.RELEASED), (0.0, 0.0, 0.0)
+    ended, origin = Fallback(ControlMode.HOLD, START_NS, FallbackReason.ENVELOPE), (0.0, 0.0, 0.0)
     assert view.estimate is not None and not carries_estimate(ended, view.belief)
     assert find_return_accel(ended, origin, view, plant) == (0.0, 0.0, 0.0)
     recover, point = Fallback(ControlMode.HOLD, START_NS), (1.0, 0.0, 0.0)

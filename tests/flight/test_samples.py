@@ -234,7 +234,7 @@ def test_a_value_whose_first_sample_cannot_have_been_lost_stays() -> None:
 
 def test_the_first_value_of_all_is_watched_and_stays_where_nothing_else_is_known() -> None:
     found = flown_on({0: 0.0, 18: 0.0}, 19)
-    assert found[0].sources.records["camera"].first_ns == START_NS
+    assert found[0].sources.tracks["camera"].first_ns == START_NS
     assert refused_as(found[18]) <= {EventCode.SAMPLE_REPEATED, EventCode.SAMPLE_FROZEN}
     assert refused_as(found[18])
     assert found[18].history.captured_ns == START_NS

@@ -29,8 +29,8 @@ from msgspec.structs import replace
 from uavctl.event_codes import EventCode
 from uavctl.flight import measure
 from uavctl.flight.controller import Controller
-from uavctl.flight.fallback import Fallback, FallbackEnd
-from uavctl.flight.monitors.verdict import release
+from uavctl.flight.fallback import Fallback, FallbackReason
+from uavctl.flight.monitors.verdict import end_plans
 from uavctl.flight.state import ControlState, FallbackGroup, MonitorGroup
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import tick as run_tick
@@ -153,7 +153,7 @@ def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit
 def test_what_is_not_believed_is_told_to_nobody(cause: EventCode, for_ns: int | None, silent: bool) -> None:
     began_ns = None if for_ns is None else START_NS - for_ns
     engaged = monitors(tick_ns=START_NS, began_ns=began_ns)
-    group = MonitorGroup(engaged=engaged, release=release(cause, ""))
+    group = MonitorGroup(engaged=engaged, breach=end_plans(cause, ""))
     assert distrusts_positions(ControlState(monitors=group)) == silent
     agreed = replace(group, engaged=replace(engaged, agreed=True))
     assert distrusts_positions(ControlState(monitors=agreed)) == (silent and cause is not EventCode.OUTSIDE)
@@ -176,20 +176,20 @@ def test_positions_that_agreed_with_inertial_data_before_we_fly_need_not_prove_t
             ),
             ours,
         )
-    assert state.monitors.engaged.motion.began_ns is not None and state.monitors.release is None
+    assert state.monitors.engaged.motion.began_ns is not None and state.monitors.breach is None
     assert state.monitors.engaged.agreed == senses
 
 
 @pytest.mark.parametrize(
-    ("end", "silent"),
-    [(FallbackEnd.RECOVER, False), (FallbackEnd.POSITIONS_DISTRUSTED, True), (FallbackEnd.STOP, False)],
+    ("reason", "silent"),
+    [(FallbackReason.RECOVER, False), (FallbackReason.POSITIONS_DISTRUSTED, True), (FallbackReason.STOP, False)],
 )
-def test_what_jumped_is_told_to_nobody(end: FallbackEnd, silent: bool) -> None:
-    fallback = Fallback(mode=ControlMode.BRAKE, since_ns=START_NS, end=end)
+def test_what_jumped_is_told_to_nobody(reason: FallbackReason, silent: bool) -> None:
+    fallback = Fallback(mode=ControlMode.BRAKE, since_ns=START_NS, reason=reason)
     flown = FallbackGroup(flown=fallback)
     assert distrusts_positions(ControlState(fallback=flown)) == silent
     old = monitors(tick_ns=START_NS, began_ns=START_NS - 9_000 * MS)
-    outside = MonitorGroup(engaged=old, release=release(EventCode.OUTSIDE, ""))
+    outside = MonitorGroup(engaged=old, breach=end_plans(EventCode.OUTSIDE, ""))
     assert distrusts_positions(ControlState(fallback=flown, monitors=outside)) == silent
     assert not distrusts_positions(ControlState())
 

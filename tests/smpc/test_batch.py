@@ -10,7 +10,7 @@ from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.batch import BatchSmpc, Information, SequentialDecider
-from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutDecider, ShortcutSolver
+from uavctl.smpc.hahn_stursberg.shortcut import FROZEN, ShortcutDecider, ShortcutSolver
 
 
 def decider() -> ShortcutDecider:

@@ -27,7 +27,7 @@ from uavctl.flight.monitors.vehicle_velocity import (
     judge_vehicle_velocity,
 )
 from uavctl.flight.monitors.verdict import Action, Verdict
-from uavctl.flight.supervise import RELEASES
+from uavctl.flight.supervise import ENVELOPE_CODES
 from uavctl.records import PositionSample, Vec3, VehicleMotion
 
 TICK_NS = 50 * MS
@@ -89,7 +89,7 @@ def update(
 ) -> tuple[MonitorState, Verdict | None]:
     """The monitors after a tick, and their verdict; None for none."""
     state, verdict = engaged.update(state, observation, parameters)
-    assert verdict.is_none or (verdict.action is Action.RELEASE and verdict.cause in RELEASES)
+    assert verdict.is_none or (verdict.action is Action.END_PLANS and verdict.cause in ENVELOPE_CODES)
     return state, None if verdict.is_none else verdict
 
 

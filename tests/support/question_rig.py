@@ -19,11 +19,11 @@ from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import PartSolver
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.horizon import make_horizon
 from uavctl.smpc.hahn_stursberg.late import add_late_designs
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 

@@ -269,7 +269,7 @@ def build_solver(design: AnyDesign, config: Config) -> Solver:
     if isinstance(design, ConditionedDesign):
         return design.solver
     if config.solver.method == "exact":
-        from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
+        from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 
         return ShortcutSolver(design)
     if design.late or design.estimate_cov.any():

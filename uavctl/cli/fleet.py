@@ -225,7 +225,7 @@ def fly(
                 is_landing = True
                 print_message(f"{reason}: all vehicles end their flights")
                 for flight in flights:
-                    flight.request_end()
+                    flight.request_fallback()
             stop_requested.wait(POLL_S) if not is_landing else time.sleep(POLL_S)
         for flight in flights:
             flight.join_output()
@@ -299,7 +299,7 @@ class FleetFlight:
         """Return whether the daemon runs."""
         return self._process is not None and self._process.poll() is None
 
-    def request_end(self) -> None:
+    def request_fallback(self) -> None:
         """Request the end, as Ctrl-C does: the vehicle brakes, holds, and lands or is handed over."""
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()

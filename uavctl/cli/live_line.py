@@ -128,9 +128,9 @@ def show_live_line(
                 print_events()
                 ticked = feed.ticked
                 print_notices(feed.notices, console)
-                if loop.release_reason and not release_shown.is_set():
+                if loop.breach_reason and not release_shown.is_set():
                     release_shown.set()
-                    console.print(label_text("letting go", loop.release_reason, "bold red"), soft_wrap=True)
+                    console.print(label_text("letting go", loop.breach_reason, "bold red"), soft_wrap=True)
                 if ticked is not None:
                     line = _format_state(ticked, loop.handover_state) + _format_recorder_warning(get_status())
                     progress.update(task, completed=ticked.decision.tick * tick_s, line=line)

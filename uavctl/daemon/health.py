@@ -100,7 +100,7 @@ class MonitoredFlight(Protocol):
         ...
 
     @property
-    def release_reason(self) -> str:
+    def breach_reason(self) -> str:
         """Reason why the envelope has released the vehicle; empty if it has not."""
         ...
 
@@ -139,7 +139,7 @@ class HealthMonitor:
         self._max_lateness_ns = 0  # of this second
         self._previous_max_lateness_ns = 0  # of the last one
         self._recording_state = "well"  # as last reported
-        self._release_reason = ""  # the same
+        self._breach_reason = ""  # the same
         self._inertial = (0, 0)  # data used and all, at the last second
         self._inertial_share: float | None = None
         self._relay_rate = (0, 0.0)  # positions at the last second, and their rate in it
@@ -155,9 +155,9 @@ class HealthMonitor:
         self._position_count += ticked.decision.accepted + ticked.decision.rejected
         self._missed += ticked.decision.missed_ticks
         self._max_lateness_ns = max(self._max_lateness_ns, lateness_ns)
-        if self._flight.release_reason and not self._release_reason:
-            self._release_reason = self._flight.release_reason
-            self._write_line(f"error: the vehicle is released: {self._release_reason}")
+        if self._flight.breach_reason and not self._breach_reason:
+            self._breach_reason = self._flight.breach_reason
+            self._write_line(f"error: the vehicle is released: {self._breach_reason}")
         if at_ns - self._reported_ns >= PERIOD_NS:
             self._reported_ns = at_ns
             self._count_losses()
@@ -217,7 +217,7 @@ class HealthMonitor:
             who_flies=flight.handover_state.value,
             ending=flight.account.end_sentence,
             relay=self._make_relay_health(),
-            let_go=flight.release_reason,
+            let_go=flight.breach_reason,
             inertial=self._inertial_share,
         )
 

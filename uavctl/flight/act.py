@@ -1,7 +1,7 @@
 """Phase 5 of a tick: pass the setpoint through the last gate, and note the input in the filter.
 
 1. A plan gives its input of this step. The fallback gives braking, the acceleration of HOLD, and the way back.
-2. The last gate bounds and slew-limits it. Once a monitor released the vehicle it is level at once: slewing would be
+2. The limiter bounds and slew-limits it. After a breach of the envelope the vehicle is level at once: slewing would be
    flown on data that cannot be believed.
 3. The input acts in the filter from now on, or after the dead time. While the vehicle takes no setpoints others fly.
 4. Positions that a monitor distrusts while the vehicle climbs or lands at our request are dropped, from the next tick
@@ -17,7 +17,7 @@ from uavctl.arrays import Array
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.decide import Decided, carries_estimate, find_braking_velocity, find_hold_accel
 from uavctl.flight.estimator import FilterHistory, PendingInputs, drop_samples, note_input
-from uavctl.flight.fallback import Fallback, FallbackEnd, compute_brake_accel, compute_return_accel
+from uavctl.flight.fallback import Fallback, FallbackReason, compute_brake_accel, compute_return_accel
 from uavctl.flight.kalman import read_capture_ns
 from uavctl.flight.limits import ZERO, limit_setpoint
 from uavctl.flight.measure import Measured
@@ -73,8 +73,8 @@ def _make_setpoint(
         wanted = _compute_fallback_accel(fallback, state, context, supervised, decided)
     elif plan is not None:
         wanted = controller.plant.to_accel(np.array(plan.inputs[context.step - plan.seq]))
-    is_released = fallback is not None and fallback.end is FallbackEnd.RELEASED
-    before = ZERO if is_released else state.plan.sent_mps2
+    is_level = fallback is not None and fallback.reason is FallbackReason.ENVELOPE
+    before = ZERO if is_level else state.plan.sent_mps2
     accel, limited = limit_setpoint(wanted, before, controller.tick_ns * 1e-9, controller.limits)
     setpoint = Setpoint(at_ns=context.at_ns, accel_mps2=accel, source=source, limited=limited)
     return setpoint, controller.plant.to_input(accel)

@@ -34,9 +34,9 @@ class TickContext(msgspec.Struct, frozen=True, eq=False):
     boundary_ns: int  # when step k began [ns]
     is_boundary: bool  # whether this is the first tick of its step that runs
     mode: ControlMode  # mode of the tick before
-    is_flown: bool  # whether we flew in the tick before
+    was_in_control: bool  # whether we flew in the tick before
     not_ready_reason: str  # why the vehicle takes no setpoints; empty if it does
-    is_ours: bool  # whether the vehicle is in the air and takes setpoints, as far as it is known
+    is_controllable: bool  # whether the vehicle is in the air and takes setpoints, as far as it is known
 
     @property
     def at_ns(self) -> int:
@@ -68,9 +68,9 @@ def locate_on_grid(
         boundary_ns=inputs.at_ns - into * controller.tick_ns,
         is_boundary=state.plan.decided_step is None or step > state.plan.decided_step,
         mode=mode,
-        is_flown=mode not in _NOT_FLOWN,
+        was_in_control=mode not in _NOT_FLOWN,
         not_ready_reason=unready,
-        is_ours=vehicle is not None and not unready and not vehicle.landed and not vehicle.own_climb,
+        is_controllable=vehicle is not None and not unready and not vehicle.landed and not vehicle.own_climb,
     )
 
 

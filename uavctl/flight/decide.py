@@ -21,7 +21,7 @@ from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import make_estimate, select_covariance
-from uavctl.flight.fallback import Fallback, FallbackEnd, advance_fallback, begin_fallback, request_end
+from uavctl.flight.fallback import Fallback, FallbackReason, advance_fallback, begin_fallback, request_fallback
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
@@ -40,11 +40,11 @@ MISSION_OVER = "the mission is over: landing"
 PLANNED_NS = 1_000_000_000
 CARRIES_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL = {
-    FallbackEnd.CONTROLLER_FAILED: "the controller has failed",
-    FallbackEnd.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
-    FallbackEnd.RELEASED: "what is seen cannot be",
-    FallbackEnd.STOP: "the operator asked for the hand-over",
-    FallbackEnd.LAND: "landing is due",
+    FallbackReason.CONTROLLER_FAILED: "the controller has failed",
+    FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
+    FallbackReason.ENVELOPE: "what is seen cannot be",
+    FallbackReason.STOP: "the operator asked for the hand-over",
+    FallbackReason.LAND: "landing is due",
 }
 
 
@@ -100,14 +100,14 @@ def _begin(phase: _Phase, ordered: Ordered) -> Decided:
     """Apply what orders, monitors and the operator's stop have changed."""
     state, supervised, at_ns = phase.state, phase.supervised, phase.context.at_ns
     fallback = ordered.fallback
-    for end in supervised.ends:
-        fallback = request_end(fallback, end, at_ns)
+    for reason in supervised.fallback_reasons:
+        fallback = request_fallback(fallback, reason, at_ns)
     before, outliers = state.fallback.flown, state.estimator.sources.outliers
-    is_final = fallback is not None and fallback.final
-    becomes_final = is_final and not (before is not None and before.final)
+    is_final = fallback is not None and fallback.is_final
+    becomes_final = is_final and not (before is not None and before.is_final)
     jump_suspected = state.fallback.jump_suspected or (becomes_final and outliers is not None and outliers.is_likely)
     if phase.context.inputs.stop:
-        fallback = request_end(fallback, FallbackEnd.STOP, at_ns)
+        fallback = request_fallback(fallback, FallbackReason.STOP, at_ns)
     return Decided(
         plan=_mark_plan_outdated(state.plan.flown, supervised),
         fallback=fallback,
@@ -153,11 +153,11 @@ def _decide_handed_over(begun: Decided, phase: _Phase) -> Decided | None:
     """Decide for a vehicle that is handed over, stopped, silent, or takes no setpoints; None for any other."""
     inputs, why_not = phase.context.inputs, phase.context.not_ready_reason
     at_ns, fallback = phase.context.at_ns, begun.fallback
-    if fallback is not None and fallback.ended:
+    if fallback is not None and fallback.is_over:
         return _fall_back(begun, fallback, phase, "handed over")
-    is_stopped = inputs.stop or (fallback is not None and fallback.end is FallbackEnd.STOP)
+    is_stopped = inputs.stop or (fallback is not None and fallback.reason is FallbackReason.STOP)
     if why_not and is_stopped:
-        ended = Fallback(mode=ControlMode.STOPPED, since_ns=at_ns, end=FallbackEnd.STOP)
+        ended = Fallback(mode=ControlMode.STOPPED, since_ns=at_ns, reason=FallbackReason.STOP)
         return replace(begun, plan=None, fallback=ended, reason=f"the operator stopped; {why_not}")
     if inputs.vehicle is None and begun.mode is not ControlMode.WAIT:
         return _wait_for_vehicle(begun, fallback or begin_fallback(at_ns), phase)
@@ -169,11 +169,11 @@ def _decide_handed_over(begun: Decided, phase: _Phase) -> Decided | None:
 def _decide_fallback(begun: Decided, phase: _Phase) -> Decided | None:
     """Decide for a final fallback, or a verdict to brake; None without either."""
     supervised, fallback = phase.supervised, begun.fallback
-    if fallback is not None and fallback.final:
-        why, released = _FINAL[fallback.end], supervised.monitors.release
-        if fallback.end is FallbackEnd.RELEASED and released is not None:
-            why = released.text
-        elif fallback.end is FallbackEnd.CONTROLLER_FAILED:
+    if fallback is not None and fallback.is_final:
+        why, breach = _FINAL[fallback.reason], supervised.monitors.breach
+        if fallback.reason is FallbackReason.ENVELOPE and breach is not None:
+            why = breach.text
+        elif fallback.reason is FallbackReason.CONTROLLER_FAILED:
             why = begun.fault
         return _fall_back(begun, fallback, phase, why)
     if begun.plan is not None and not supervised.brake.is_none:
@@ -211,7 +211,7 @@ def _plan_from(begun: Decided, belief: Belief, phase: _Phase) -> Decided:
     mission = advance_mission(controller.mission, begun.mission, base.mean, context.boundary_ns)
     begun = replace(begun, mission=mission)
     if controller.mission.land and begun.order is None and is_over(controller.mission, mission, context.boundary_ns):
-        landing = request_end(begun.fallback, FallbackEnd.LAND, context.at_ns)
+        landing = request_fallback(begun.fallback, FallbackReason.LAND, context.at_ns)
         return _fall_back(begun, landing, phase, MISSION_OVER)
     if not begun.fault and not supervised.wall.is_none:
         begun = replace(begun, fault=supervised.wall.text)
@@ -285,14 +285,14 @@ def _has_new_inertial(plan: Plan | None, phase: _Phase) -> bool:
 
 def _give_up_controller(begun: Decided, phase: _Phase) -> Decided:
     """Let the fallback fly for good: the controller of another package has failed."""
-    fallback = request_end(begun.fallback, FallbackEnd.CONTROLLER_FAILED, phase.context.at_ns)
+    fallback = request_fallback(begun.fallback, FallbackReason.CONTROLLER_FAILED, phase.context.at_ns)
     return _fall_back(begun, fallback, phase, begun.fault)
 
 
 def _fall_back(begun: Decided, fallback: Fallback, phase: _Phase, reason: str) -> Decided:
     """Let the fallback fly, and advance it; the count of fresh samples starts anew where it begins."""
     before, fallback = fallback, _advance(begun, fallback, phase)
-    if fallback.mode is ControlMode.LAND and not fallback.final:
+    if fallback.mode is ControlMode.LAND and not fallback.is_final:
         held_s = (phase.context.at_ns - (before.held_ns or phase.context.at_ns)) * 1e-9
         reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
     consecutive = 0 if begun.fallback is None else begun.consecutive_samples
@@ -318,11 +318,11 @@ def _wait_for_vehicle(begun: Decided, fallback: Fallback, phase: _Phase) -> Deci
         "the vehicle's heartbeats are missing" if moves_now(inputs.motion, inputs.at_ns) else "no vehicle is heard"
     )
     consecutive = 0 if begun.fallback is None else begun.consecutive_samples
-    if later.ended:
+    if later.is_over:
         reason = f"{unheard}, and the time to hold is over: its own failsafe is left to act"
         due = fallback
-        if not fallback.final:
-            due = Fallback(mode=fallback.mode, since_ns=fallback.since_ns, end=FallbackEnd.LAND)
+        if not fallback.is_final:
+            due = Fallback(mode=fallback.mode, since_ns=fallback.since_ns, reason=FallbackReason.LAND)
         return replace(
             begun, plan=None, fallback=due, consecutive_samples=consecutive, reason=reason, sends_nothing=True
         )
@@ -351,7 +351,7 @@ def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
     """Whether the vehicle's own inertial data carry the estimate on, with nothing against it."""
     if belief is None or belief.inertial.used_ns is None or belief.inertial.distrusted_ns is not None:
         return False
-    return not fallback.final and belief.at_ns - belief.inertial.used_ns <= CARRIES_NS
+    return not fallback.is_final and belief.at_ns - belief.inertial.used_ns <= CARRIES_NS
 
 
 def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, supervised: Supervised) -> Vec3:
@@ -364,8 +364,8 @@ def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, su
     if witnessed and view.estimate is not None and carries_estimate(fallback, view.belief):
         bias = view.estimate.bias
     # The vehicle keeps zero itself when nothing more is sent.
-    is_last = fallback.final and fallback.mode is ControlMode.HOLD
-    if not bias or is_last or fallback.end is FallbackEnd.RELEASED:
+    is_last = fallback.is_final and fallback.mode is ControlMode.HOLD
+    if not bias or is_last or fallback.reason is FallbackReason.ENVELOPE:
         return ZERO
     # a = a(-d)
     north, east, down = context.controller.plant.to_accel(-np.array(bias))

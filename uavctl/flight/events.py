@@ -2,8 +2,8 @@
 
 1. The link estimate counts the step that ends at a boundary.
 2. Alarms that last are reported once, when they begin: the link, inertial data, the bias, a strong push.
-3. Orders, a new start of the filter, a release, a failed controller, refused samples, missed ticks, the solver, relaxed
-   limits and a change of mode have an event each, in this order.
+3. Orders, a new start of the filter, a breach of the envelope, a failed controller, refused samples, missed ticks,
+   the solver, relaxed limits and a change of mode have an event each, in this order.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from uavctl.event_codes import MISSION, EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.decide import Decided
 from uavctl.flight.estimator import find_newest_belief
-from uavctl.flight.fallback import Fallback, FallbackEnd
+from uavctl.flight.fallback import Fallback, FallbackReason
 from uavctl.flight.link_estimate import LinkBelief, count_step, estimate_link
 from uavctl.flight.measure import Measured
 from uavctl.flight.monitors.acceleration import describe_push
@@ -105,13 +105,13 @@ def _make_event(at_ns: int, severity: Severity, code: str, text: str, count: int
 def _report_faults(
     state: ControlState, context: TickContext, measured: Measured, supervised: Supervised, decided: Decided
 ) -> Iterable[Event]:
-    """Report a new start of the filter, a release of the vehicle, and a controller that is given up."""
-    at_ns, released = context.at_ns, supervised.released
+    """Report a new start of the filter, a breach of the envelope, and a controller that is given up."""
+    at_ns, breach = context.at_ns, supervised.breach
     if measured.restarted:
         text = "positions jumped while nobody flew on them; the estimate begins anew"
         yield _make_event(at_ns, Severity.WARNING, EventCode.POSITION_RESTART, text)
-    if released is not None and released.cause is not None:
-        yield _make_event(at_ns, Severity.ERROR, released.cause.value, released.text)
+    if breach is not None and breach.cause is not None:
+        yield _make_event(at_ns, Severity.ERROR, breach.cause.value, breach.text)
     if decided.fault and not state.monitors.external.fault:
         yield _make_event(at_ns, Severity.ERROR, EventCode.CONTROLLER_FAULT, decided.fault)
 
@@ -138,14 +138,14 @@ def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -
     is_mission_over = _lands(decided.fallback) and not _lands(ordered.fallback)
     if mode is not context.mode or is_mission_over:
         severity, code = _ENTERED[mode]
-        if decided.fallback is not None and decided.fallback.end >= FallbackEnd.STOP:
+        if decided.fallback is not None and decided.fallback.reason >= FallbackReason.STOP:
             severity = Severity.INFO  # somebody wanted it
         subject = MISSION if is_mission_over else ""
         yield _make_event(at_ns, severity, code, decided.reason, subject=subject)
 
 
 def _lands(fallback: Fallback | None) -> bool:
-    return fallback is not None and fallback.end is FallbackEnd.LAND
+    return fallback is not None and fallback.reason is FallbackReason.LAND
 
 
 def _count_link(
@@ -179,7 +179,7 @@ def _report_link(alarms: tuple[str, ...], reported: tuple[str, ...], link: LinkE
 def _find_inertial_use(context: TickContext, supervised: Supervised) -> str:
     """Find the use of the vehicle's inertial data as an event code; empty if none are used or we do not fly."""
     history, kalman = supervised.view.history, context.controller.kalman
-    if not (kalman.n_inertial and context.is_flown and context.is_ours):
+    if not (kalman.n_inertial and context.was_in_control and context.is_controllable):
         return ""
     belief = find_newest_belief(kalman, history)
     if belief is None:
@@ -200,7 +200,7 @@ def _report_inertial(before: str, now: str, at_ns: int) -> Iterable[Event]:
 def _find_bias(context: TickContext, supervised: Supervised) -> tuple[float, ...]:
     """Find the bias that is flown against; empty where there is none, or others fly."""
     estimate = supervised.view.estimate
-    return estimate.bias if estimate is not None and context.is_flown and context.is_ours else ()
+    return estimate.bias if estimate is not None and context.was_in_control and context.is_controllable else ()
 
 
 def find_inputs_at_bound(bias: Sequence[float], bounds: Sequence[float], reported: Sequence[int]) -> tuple[int, ...]:

@@ -2,13 +2,13 @@
 
 A state machine of four modes, each with a time limit:
 
-    BRAKE --slow enough, or brake_s over--> HOLD --as its end says--> LAND --next tick--> STOPPED
+    BRAKE --slow enough, or brake_s over--> HOLD --by its reason--> LAND --next tick--> STOPPED
 
-    end                    from HOLD
+    reason                 from HOLD
     RECOVER                LAND after hold_s, or blind_hold_s, if configured; else it holds on
     CONTROLLER_FAILED      LAND once its zero has been sent, if configured; else STOPPED
     POSITIONS_DISTRUSTED   the same
-    RELEASED               the same; it does not brake before, as no position is believed: level at once
+    ENVELOPE               the same; it does not brake before, as no position is believed: level at once
     STOP                   LAND once its zero has been sent, if configured; else STOPPED
     LAND                   LAND once its zero has been sent
 
@@ -17,7 +17,7 @@ A state machine of four modes, each with a time limit:
    runs on.
 2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates.
 3. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.
-4. The way back to TRACK, from BRAKE and HOLD with end RECOVER only, is decided at Δt boundaries
+4. The way back to TRACK, from BRAKE and HOLD with reason RECOVER only, is decided at Δt boundaries
    (`uavctl.flight.decide`).
 """
 
@@ -46,19 +46,19 @@ class FallbackParameters:
     brake_s: float  # longest time of braking [s]
     hold_s: float  # time of zero acceleration before landing [s]
     blind_hold_s: float  # longest time of it where not even the vehicle itself tells whether it drifts [s]
-    land: bool  # whether to hand over to the vehicle's own landing after that
+    land: bool  # whether the vehicle's own landing is requested after that
     recover_samples: int  # fresh samples in a row before plans are flown again
 
 
-class FallbackEnd(IntEnum):
-    """End of the fallback; a greater one overrides a smaller one, and there is no way back to a smaller one."""
+class FallbackReason(IntEnum):
+    """Reason of the fallback, which decides its end. A greater one overrides a smaller one, for good."""
 
-    RECOVER = auto()  # plans, once positions are back; until then as configured
-    CONTROLLER_FAILED = auto()  # a controller of another package has failed: as configured, and no plan again
-    POSITIONS_DISTRUSTED = auto()  # no position is believed any more: as configured, and no plan again
-    RELEASED = auto()  # a monitor released the vehicle: the same, without braking
-    STOP = auto()  # the operator's stop: as configured, and then nothing is sent
-    LAND = auto()  # the vehicle's own landing, whatever is configured
+    RECOVER = auto()  # too few positions: plans fly again once they are back
+    CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
+    POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
+    ENVELOPE = auto()  # a monitor found the motion impossible: no plan again, and no braking
+    STOP = auto()  # the operator's stop
+    LAND = auto()  # an order to land, or the mission is over: it lands whatever `fallback.land` says
 
 
 @dataclass(frozen=True)
@@ -67,18 +67,18 @@ class Fallback:
 
     mode: ControlMode  # BRAKE, HOLD, LAND or STOPPED
     since_ns: int  # when this mode was entered [ns]
-    end: FallbackEnd = FallbackEnd.RECOVER  # end of the fallback
+    reason: FallbackReason = FallbackReason.RECOVER
     held_ns: int | None = None  # when it first held [ns]; None before
 
     @property
-    def ended(self) -> bool:
-        """Whether the vehicle has been handed over: nothing is sent any more."""
+    def is_over(self) -> bool:
+        """Whether the fallback is over: no setpoint is sent any more."""
         return self.mode in (ControlMode.LAND, ControlMode.STOPPED)
 
     @property
-    def final(self) -> bool:
+    def is_final(self) -> bool:
         """Whether there is no way back to plans."""
-        return self.end is not FallbackEnd.RECOVER
+        return self.reason is not FallbackReason.RECOVER
 
 
 def begin_fallback(at_ns: int) -> Fallback:
@@ -86,15 +86,15 @@ def begin_fallback(at_ns: int) -> Fallback:
     return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns)
 
 
-def request_end(fallback: Fallback | None, end: FallbackEnd, at_ns: int) -> Fallback:
-    """Request an end other than RECOVER. The fallback brakes first, unless no velocity may be believed."""
-    if fallback is not None and (fallback.ended or fallback.end >= end):
+def request_fallback(fallback: Fallback | None, reason: FallbackReason, at_ns: int) -> Fallback:
+    """Request a reason other than RECOVER. The fallback brakes first, unless no velocity may be believed."""
+    if fallback is not None and (fallback.is_over or fallback.reason >= reason):
         return fallback
-    if end is FallbackEnd.RELEASED:
-        return Fallback(mode=ControlMode.HOLD, since_ns=at_ns, end=end)
-    if fallback is not None and (fallback.mode is ControlMode.BRAKE or fallback.end is FallbackEnd.RELEASED):
-        return replace(fallback, end=end)
-    return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns, end=end)
+    if reason is FallbackReason.ENVELOPE:
+        return Fallback(mode=ControlMode.HOLD, since_ns=at_ns, reason=reason)
+    if fallback is not None and (fallback.mode is ControlMode.BRAKE or fallback.reason is FallbackReason.ENVELOPE):
+        return replace(fallback, reason=reason)
+    return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns, reason=reason)
 
 
 def advance_fallback(
@@ -135,12 +135,12 @@ def advance_fallback(
             return replace(fallback, mode=ControlMode.HOLD, since_ns=at_ns, held_ns=held_ns)
         return fallback
     # A vehicle keeps its last setpoint for a while: that one is HOLD's zero, once the last gate lets it through.
-    settled = fallback.final and (sent_mps2 == ZERO or elapsed_s >= SETTLE_S)
+    settled = fallback.is_final and (sent_mps2 == ZERO or elapsed_s >= SETTLE_S)
     if settled or due:
-        after = _follow_hold(fallback.end, parameters.land)
+        after = _follow_hold(fallback.reason, parameters.land)
         if after is not ControlMode.HOLD:
             return replace(fallback, mode=after, since_ns=at_ns)
-    if mode is ControlMode.HOLD and measured and not fallback.final and speed_mps > DRIFT_MPS:
+    if mode is ControlMode.HOLD and measured and not fallback.is_final and speed_mps > DRIFT_MPS:
         return replace(fallback, mode=ControlMode.BRAKE, since_ns=at_ns)
     return fallback
 
@@ -177,7 +177,7 @@ def _limit_return(accel_mps2: float) -> float:
     return min(max(accel_mps2, -RETURN_MPS2), RETURN_MPS2) if math.isfinite(accel_mps2) else 0.0
 
 
-def _follow_hold(end: FallbackEnd, land: bool) -> ControlMode:
-    if land or end is FallbackEnd.LAND:
+def _follow_hold(reason: FallbackReason, land: bool) -> ControlMode:
+    if land or reason is FallbackReason.LAND:
         return ControlMode.LAND
-    return ControlMode.HOLD if end is FallbackEnd.RECOVER else ControlMode.STOPPED
+    return ControlMode.HOLD if reason is FallbackReason.RECOVER else ControlMode.STOPPED

@@ -1,5 +1,7 @@
 """Phase 1 of a tick: gate its position and inertial samples, and update the filter history.
 
+The monitors of single samples run here (frozen sources, outliers); all others run in phase 2.
+
 1. Inputs that begin to act are noted in the filter.
 2. A sample that is invalid is refused. Each other one is compared with what is known, in the order of capture: frozen
    sources first, then outliers (`uavctl.flight.monitors`). What is refused is as good as lost.
@@ -37,7 +39,7 @@ from uavctl.flight.estimator import (
 )
 from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, read_capture_ns, read_measurement
 from uavctl.flight.monitors import frozen, outliers
-from uavctl.flight.monitors.frozen import MovedNs, PredictedSample
+from uavctl.flight.monitors.frozen import LastMotionNs, PredictedSample
 from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierObservation, OutlierTrack, Reach
 from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
@@ -82,7 +84,7 @@ def measure(state: ControlState, context: TickContext) -> Measured:
     samples = gate_samples(
         kalman, controller.reach, history, estimator.sources, inputs, controller.horizon, estimator.consecutive_samples
     )
-    restarted = samples.source_moved and not context.is_flown
+    restarted = samples.source_moved and not context.was_in_control
     if restarted:
         samples = _restart(kalman, samples, inputs.at_ns)
     history = samples.history
@@ -116,8 +118,8 @@ def gate_samples(
     """
     newest_ns = history.captured_ns
     history = move_window(kalman, history, inputs.at_ns)
-    moved_ns = _find_moved_ns(sources.moved_ns, inputs, reach.parameters.at_rest_mps)
-    sources = replace(sources, moved_ns=moved_ns)
+    last_motion_ns = _find_last_motion_ns(sources.last_motion_ns, inputs, reach.parameters.at_rest_mps)
+    sources = replace(sources, last_motion_ns=last_motion_ns)
     samples = GatedSamples(history, sources)
     if inputs.samples:
         samples = _gate_in_order(kalman, reach, history, sources, inputs)
@@ -171,22 +173,24 @@ def _gate_in_order(
     valid = [sample for sample, reason in zip(inputs.samples, reasons, strict=True) if reason is None]
     refused = [(sample, reason) for sample, reason in zip(inputs.samples, reasons, strict=True) if reason is not None]
     accepted: list[PositionSample] = []
-    clean_ns: int | None = None
+    dropped_after_ns: int | None = None
     for sample in sorted(valid, key=read_capture_ns):
         at_ns = read_capture_ns(sample)
         belief = predict_belief(kalman, history, at_ns) if at_ns > history.window_begin_ns else None
         if history.captured_ns is None:
-            first = frozen.record_sample(sources.records, kalman, history, sample, np.zeros(len(kalman.axes)))
-            sources = replace(sources, records=first)
+            first = frozen.track_sample(sources.tracks, kalman, history, sample, np.zeros(len(kalman.axes)))
+            sources = replace(sources, tracks=first)
         if belief is not None:  # else it is the first one, or too old
             sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, belief)
             if verdict.cause is not None:
                 code = verdict.cause.value
                 if verdict.since_ns is not None:
-                    is_repeat = _captured_since(sample.source, verdict.since_ns)
-                    history, clean_ns = _drop_repeats(kalman, history, is_repeat, verdict.since_ns, clean_ns)
-                    refused.extend((one, code) for one in accepted if is_repeat(one))
-                    accepted = [one for one in accepted if not is_repeat(one)]
+                    is_distrusted = _captured_since(sample.source, verdict.since_ns)
+                    history, dropped_after_ns = _drop_distrusted(
+                        kalman, history, is_distrusted, verdict.since_ns, dropped_after_ns
+                    )
+                    refused.extend((other, code) for other in accepted if is_distrusted(other))
+                    accepted = [other for other in accepted if not is_distrusted(other)]
                 refused.append((sample, code))
                 continue
         history, reason = insert_sample(kalman, history, sample, belief)
@@ -195,7 +199,7 @@ def _gate_in_order(
         else:
             refused.append((sample, reason))
     sources = replace(sources, absurd=_track_absurd(sources.absurd, kalman, bool(accepted), refused))
-    return GatedSamples(history, sources, tuple(accepted), tuple(refused), clean_ns)
+    return GatedSamples(history, sources, tuple(accepted), tuple(refused), dropped_after_ns)
 
 
 def _track_absurd(
@@ -220,26 +224,26 @@ def _captured_since(source: str, first_ns: int) -> Callable[[PositionSample], bo
     return lambda sample: sample.source == source and read_capture_ns(sample) >= first_ns
 
 
-def _drop_repeats(
+def _drop_distrusted(
     kalman: Kalman,
     history: FilterHistory,
-    is_repeat: Callable[[PositionSample], bool],
+    is_distrusted: Callable[[PositionSample], bool],
     first_ns: int,
-    clean_ns: int | None,
+    dropped_after_ns: int | None,
 ) -> tuple[FilterHistory, int | None]:
     """Drop the samples of a frozen source since `first_ns`; return too the time after which any were dropped so far.
 
     The value that first came then goes too: it may be an older one, which the link had lost when it was new. It stays
     where nothing else is known.
     """
-    cleaned = drop_samples(history, is_repeat)
+    cleaned = drop_samples(history, is_distrusted)
     last_ns = find_newest_capture_ns(kalman, cleaned, first_ns)
     if last_ns is None:
-        cleaned = drop_samples(history, lambda one: is_repeat(one) and read_capture_ns(one) > first_ns)
+        cleaned = drop_samples(history, lambda sample: is_distrusted(sample) and read_capture_ns(sample) > first_ns)
         last_ns = first_ns
     if len(cleaned.entries) == len(history.entries):
-        return history, clean_ns
-    return cleaned, last_ns if clean_ns is None else min(last_ns, clean_ns)
+        return history, dropped_after_ns
+    return cleaned, last_ns if dropped_after_ns is None else min(last_ns, dropped_after_ns)
 
 
 def _judge_sample(
@@ -257,26 +261,24 @@ def _judge_sample(
     # ν = y - H z
     offset = values - belief.mean[kalman.measured_index[: len(values)]]
     observation = PredictedSample(
-        sample, offset[:n_axes], kalman, history, _is_flying(inputs.vehicle), sources.moved_ns, reach.parameters
+        sample, offset[:n_axes], kalman, history, _is_flying(inputs.vehicle), sources.last_motion_ns, reach.parameters
     )
-    records, verdict = frozen.update(sources.records, observation)
-    sources = replace(sources, records=records)
+    tracks, verdict = frozen.update(sources.tracks, observation)
+    sources = replace(sources, tracks=tracks)
     if not verdict.is_none:
         return sources, verdict
     error_mps = np.zeros(n_axes) if sources.velocity_error_mps is None else sources.velocity_error_mps
     width = outliers.compute_gate(reach, kalman, belief, variances, error_mps)
-    track, verdict = outliers.update(sources.outliers, OutlierObservation(at_ns, offset, width, n_axes))
+    outlier_track, verdict = outliers.update(sources.outliers, OutlierObservation(at_ns, offset, width, n_axes))
     if verdict.is_none:
         if at_ns > (history.captured_ns or at_ns):
             error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
             sources = replace(sources, velocity_error_mps=error_mps)
-        return replace(sources, outliers=track), NO_VERDICT
-    record = records[sample.source]
-    if record.at_ns == at_ns and record.repeats:
-        return sources, Verdict(
-            Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN
-        )  # a value that came before did not jump
-    return replace(sources, outliers=track), verdict
+        return replace(sources, outliers=outlier_track), NO_VERDICT
+    if frozen.is_repeat(tracks[sample.source], at_ns):
+        # A value that came before did not jump: the prediction has moved away from a source that is frozen.
+        return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN)
+    return replace(sources, outliers=outlier_track), verdict
 
 
 def _is_flying(vehicle: VehicleStatus | None) -> bool:
@@ -284,7 +286,7 @@ def _is_flying(vehicle: VehicleStatus | None) -> bool:
     return vehicle is None or (vehicle.armed and not vehicle.landed)
 
 
-def _find_moved_ns(before_ns: MovedNs, inputs: StepInput, at_rest_mps: float) -> MovedNs:
+def _find_last_motion_ns(before_ns: LastMotionNs, inputs: StepInput, at_rest_mps: float) -> LastMotionNs:
     """Find when the vehicle last moved in each axis, by its own velocity; without one it counts as moving."""
     velocity = read_vehicle_velocity(inputs.motion, inputs.at_ns) or (math.inf,) * 3
     rows = zip(before_ns, velocity, strict=True)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import TickContext
-from uavctl.flight.fallback import Fallback, FallbackEnd, request_end
+from uavctl.flight.fallback import Fallback, FallbackReason, request_fallback
 from uavctl.flight.mission import Mission, MissionState, Room, resume, stay_at
 from uavctl.flight.state import ControlState
 from uavctl.records import Command, Event, Order, Severity, Vec3, Vector
@@ -48,7 +48,7 @@ def take_orders(state: ControlState, context: TickContext) -> Ordered:
         if reason:
             continue
         if command.order is Order.LAND:
-            fallback = request_end(ordered.fallback, FallbackEnd.LAND, context.at_ns)
+            fallback = request_fallback(ordered.fallback, FallbackReason.LAND, context.at_ns)
             ordered = replace(ordered, fallback=fallback)
         else:
             ordered = replace(ordered, order=command)
@@ -78,12 +78,12 @@ def describe_order(command: Command) -> str:
 def _find_refusal(ordered: Ordered, command: Command, context: TickContext) -> str:
     """Return why an order is refused; empty if it is accepted."""
     fallback, mission = ordered.fallback, context.controller.mission
-    if fallback is not None and fallback.ended:
+    if fallback is not None and fallback.is_over:
         return "the vehicle has been handed over"
     if command.order is Order.LAND:
         # A fallback flies on while the vehicle is silent, and lands when it is heard again.
         return "" if context.inputs.vehicle is None and fallback is not None else context.not_ready_reason
-    if fallback is not None and fallback.final:
+    if fallback is not None and fallback.is_final:
         return "the vehicle is on its way down"
     if command.order is Order.RESUME:
         left = ordered.mission is not None and ordered.mission.stay is not None

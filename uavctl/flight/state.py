@@ -13,7 +13,7 @@ from uavctl.flight.link_estimate import NO_COUNTS, LinkBelief
 from uavctl.flight.mission import MissionState
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import ExternalState
-from uavctl.flight.monitors.frozen import MovedNs, SourceRecords
+from uavctl.flight.monitors.frozen import LastMotionNs, SourceTracks
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Command, ControlMode, Plan, Vec3
@@ -27,8 +27,8 @@ class SourceHealth(msgspec.Struct, frozen=True, eq=False):
     absurd: OutlierTrack | None = None
     # Bound of the velocity's error, each axis of the plant [m/s]; None before the first sample
     velocity_error_mps: Array | None = None
-    records: SourceRecords = msgspec.field(default_factory=dict)  # record of each source
-    moved_ns: MovedNs = (0, 0, 0)  # when the vehicle last moved north, east and down, by its own velocity [ns]
+    tracks: SourceTracks = msgspec.field(default_factory=dict)  # what each source has shown
+    last_motion_ns: LastMotionNs = (0, 0, 0)  # when the vehicle last moved, each axis, by its own velocity
 
 
 class InertialReading(msgspec.Struct, frozen=True):
@@ -53,7 +53,7 @@ class MonitorGroup(msgspec.Struct, frozen=True, eq=False):
 
     engaged: MonitorState = INITIAL  # of the vehicle's motion in this flight
     unengaged: MonitorState = INITIAL  # the same while the vehicle is armed and others fly it
-    release: Verdict | None = None  # the verdict that released the vehicle; None as long as none did
+    breach: Verdict | None = None  # the verdict that ended the flight on plans; None as long as none did
     position_inconsistent: bool = False  # positions could not be the vehicle's own, at some time since it was armed
     # The operator has asked for a vehicle that is outside the room, and it has not been inside since
     return_ordered: bool = False

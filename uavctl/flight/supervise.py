@@ -1,22 +1,26 @@
 """Phase 2 of a tick: run the monitors, and turn their verdicts into actions.
 
-This is the only table from verdicts to actions; verdicts on single samples refuse them in `measure.py`:
+This is the only table from verdicts to actions. Phase 1 acts on those about single samples, phase 2 on all others:
 
-    monitor               verdict                     positions           inertial data       flight
-    engaged               release (`envelope-…`)      drop since clean    -                   RELEASED: level, land
-    sources               release, source moved       drop since clean    -                   POSITIONS_DISTRUSTED
-    sources               release, all absurd         drop since clean    -                   POSITIONS_DISTRUSTED
-    sources, in WAIT      release, all absurd         drop since clean    -                   RELEASED
-    external              release, too late           -                   -                   CONTROLLER_FAILED
-    external              release, near a wall        -                   -                   the same, in phase 4
-    inertial              distrust inertial data      -                   drop since the      -
-                                                                          newest position
-    outliers              brake, positions jumped     refused (phase 1)   -                   BRAKE while a plan flies
-    sources               brake, all absurd           refused (phase 1)   -                   BRAKE while a plan flies
-    prediction            brake                       -                   -                   BRAKE while a plan flies
-    frozen                distrust positions          drop (phase 1)      -                   -
-    vehicle_velocity      distrust its velocity       -                   -                   brake by the prediction
-    unengaged             release, climb or landing  drop after phase 5  -                   no climb on positions
+    monitor           verdict                   positions              inertial data          flight
+    engaged           end plans (`envelope-…`)  drop since consistent  -                      ENVELOPE: level, land
+    sources           end plans, source moved   drop since consistent  -                      POSITIONS_DISTRUSTED
+    sources           end plans, all absurd     drop since consistent  -                      POSITIONS_DISTRUSTED
+    sources, in WAIT  end plans, all absurd     drop since consistent  -                      ENVELOPE
+    external          end plans, too slow       -                      -                      CONTROLLER_FAILED
+    external          end plans, near a wall    -                      -                      the same, in phase 4
+    inertial          distrust inertial data    -                      drop since the newest  replan
+                                                                       position
+    outliers          brake, positions jumped   refused (phase 1)      -                      BRAKE while a plan flies
+    sources           brake, all absurd         refused (phase 1)      -                      BRAKE while a plan flies
+    prediction        brake                     -                      -                      BRAKE while a plan flies
+    frozen            distrust positions        drop (phase 1)         -                      replan; count as lost
+    vehicle_velocity  distrust its velocity     -                      -                      brake by the prediction
+    unengaged         end plans, in a climb or  drop after phase 5     -                      no climb on positions
+                      landing
+
+"Consistent" is the capture time of the last position with which all monitors of the motion agreed
+(`MonitorState.consistent_ns`). Positions that are lost make the age grow; at the horizon the fallback brakes.
 
 1. Inertial data are compared with the vehicle's own velocity.
 2. While we fly, the motion is watched; while others fly an armed vehicle, its positions are compared with its inertial
@@ -39,7 +43,7 @@ from uavctl.flight.estimator import (
     predict_ahead,
     predict_belief,
 )
-from uavctl.flight.fallback import FallbackEnd
+from uavctl.flight.fallback import FallbackReason
 from uavctl.flight.kalman import Belief, read_capture_ns
 from uavctl.flight.limits import ZERO
 from uavctl.flight.measure import Measured
@@ -49,28 +53,28 @@ from uavctl.flight.monitors.external import AnswerObservation, ExternalState, Wa
 from uavctl.flight.monitors.inertial import InertialObservation, Source
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
-from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, release
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
 from uavctl.records import ControlMode, Estimate, Order
 
 # Causes after which no position is believed any more.
-OF_POSITIONS = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
-RELEASES = OF_POSITIONS.union({EventCode.OUTSIDE, EventCode.BRAKING})
+POSITION_CODES = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
+ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING})
 
 PLAYED_OUT_STEPS = 2  # without a position: from there on a prediction is compared with the vehicle's own velocity
 REPLAN_STEPS = 3  # for which a plan is made anew once positions were dropped: the setpoint is slew-limited
 
-_ABSURD = release(EventCode.OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
+_ABSURD = end_plans(EventCode.OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
 _JUMPED = brake(EventCode.SAMPLE_JUMP, "positions jumped: braking until they are believed again, or not any more")
 _ABSURD_SO_FAR = brake(
     EventCode.POSITIONS_ABSURD,
     "positions are further out than any can be: braking until they are believed again, or not any more",
 )
-_ENDS = {
-    EventCode.CONTROLLER_LATE: FallbackEnd.CONTROLLER_FAILED,
-    EventCode.SOURCE_MOVED: FallbackEnd.POSITIONS_DISTRUSTED,
-    EventCode.POSITIONS_ABSURD: FallbackEnd.POSITIONS_DISTRUSTED,
-    **dict.fromkeys(RELEASES, FallbackEnd.RELEASED),
+_FALLBACK_REASONS = {
+    EventCode.CONTROLLER_LATE: FallbackReason.CONTROLLER_FAILED,
+    EventCode.SOURCE_MOVED: FallbackReason.POSITIONS_DISTRUSTED,
+    EventCode.POSITIONS_ABSURD: FallbackReason.POSITIONS_DISTRUSTED,
+    **dict.fromkeys(ENVELOPE_CODES, FallbackReason.ENVELOPE),
 }
 
 
@@ -80,13 +84,13 @@ class Supervised(msgspec.Struct, frozen=True, eq=False):
     view: FilterView  # the filter without what was dropped
     monitors: MonitorGroup
     consecutive_samples: int  # fresh samples in a row
-    released: Verdict | None  # the verdict that releases the vehicle in this tick; None for none
-    ends: tuple[FallbackEnd, ...]  # ends of the flight on plans that verdicts ask for, in this order
+    breach: Verdict | None  # the verdict that ends the flight on plans in this tick; None for none
+    fallback_reasons: tuple[FallbackReason, ...]  # reasons of verdicts that end the flight on plans, in this order
     brake: Verdict  # verdict that brakes while a plan flies
     plan_base: Belief | None  # belief that a plan begins with, at a boundary: for the time at which inputs begin to act
     wall: Verdict  # verdict that gives up a controller of another package in place of its next plan
     dropped_after_ns: int | None  # capture time after which positions were dropped [ns]; None where none were
-    replan: bool  # whether a plan is made anew though no position is new
+    replan: bool  # whether a plan is made though no position is new
     drop_later_after_ns: int | None  # capture time after which positions are dropped once the tick is over [ns]
     unsafe_to_climb: str  # why a vehicle that others fly must not climb on by its positions; empty if it may
     position_inconsistent: bool  # that is because positions cannot be its own
@@ -95,12 +99,12 @@ class Supervised(msgspec.Struct, frozen=True, eq=False):
 
 def distrusts_positions(state: ControlState) -> bool:
     """Whether positions are distrusted for good: then they are not passed on to the vehicle either."""
-    flown, verdict = state.fallback.flown, state.monitors.release
-    moved = flown is not None and flown.end is FallbackEnd.POSITIONS_DISTRUSTED
+    flown, verdict = state.fallback.flown, state.monitors.breach
+    moved = flown is not None and flown.reason is FallbackReason.POSITIONS_DISTRUSTED
     if moved or state.fallback.jump_suspected or verdict is None:
         return moved or state.fallback.jump_suspected
     # An estimate that is outside right after the start may be so because positions are wrong.
-    return verdict.cause in OF_POSITIONS or not state.monitors.engaged.confirms_positions
+    return verdict.cause in POSITION_CODES or not state.monitors.engaged.confirms_positions
 
 
 def supervise(state: ControlState, context: TickContext, measured: Measured) -> Supervised:
@@ -111,27 +115,27 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
     if not inertial_verdict.is_none:
         view = view_filter(distrust_inertial(view.history, at_ns), context)
     return_ordered = _is_return_ordered(state, view, context)
-    monitors, released = _watch_flight(state, view, measured, context, return_ordered)
+    monitors, breach = _watch_flight(state, view, measured, context, return_ordered)
     sources = _judge_sources(measured, context)
-    clean_ns, consecutive = samples.dropped_after_ns, samples.consecutive_samples
-    if not (released.is_none and sources.is_none):
-        clean_ns, consecutive = min(clean_ns or at_ns, monitors.consistent_ns or at_ns), 0
-        view = view_filter(_drop_after(view.history, clean_ns), context)
+    dropped_after_ns, consecutive = samples.dropped_after_ns, samples.consecutive_samples
+    if not (breach.is_none and sources.is_none):
+        dropped_after_ns, consecutive = min(dropped_after_ns or at_ns, monitors.consistent_ns or at_ns), 0
+        view = view_filter(_drop_after(view.history, dropped_after_ns), context)
     if context.is_boundary and view.age_steps is not None and view.age_steps >= controller.horizon:
         consecutive = 0
-    external_state, late = _judge_answer(state, context)
-    rolled_back = clean_ns is not None or not inertial_verdict.is_none
+    external_state, overdue = _judge_answer(state, context)
+    rolled_back = dropped_after_ns is not None or not inertial_verdict.is_none
     rolled_back_step = context.step if rolled_back else state.monitors.rolled_back_step
-    since = None if rolled_back_step is None else context.step - rolled_back_step
-    replans = since is not None and (0 < since <= REPLAN_STEPS or not inertial_verdict.is_none)
+    steps_since = None if rolled_back_step is None else context.step - rolled_back_step
+    replans = steps_since is not None and (0 < steps_since <= REPLAN_STEPS or not inertial_verdict.is_none)
     plan_base = _predict_plan_base(view, measured, context) if context.is_boundary else None
-    unengaged = _watch_unengaged(state, view, measured, context)
+    unengaged, ending = _watch_unengaged(state, view, measured, context), (overdue, sources, breach)
     return Supervised(
         view=view,
         monitors=MonitorGroup(
             engaged=monitors,
             unengaged=unengaged.state,
-            release=state.monitors.release if released.is_none else released,
+            breach=state.monitors.breach if breach.is_none else breach,
             position_inconsistent=unengaged.is_watched
             and (state.monitors.position_inconsistent or unengaged.position_inconsistent),
             return_ordered=return_ordered,
@@ -139,12 +143,12 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
             rolled_back_step=rolled_back_step,
         ),
         consecutive_samples=consecutive,
-        released=None if released.is_none else released,
-        ends=tuple(_ENDS[one.cause] for one in (late, sources, released) if one.cause is not None),
+        breach=None if breach.is_none else breach,
+        fallback_reasons=tuple(_FALLBACK_REASONS[verdict.cause] for verdict in ending if verdict.cause is not None),
         brake=_judge_plan(state, monitors, samples.sources, view, context),
         plan_base=plan_base,
         wall=_judge_wall(state, plan_base, context),
-        dropped_after_ns=clean_ns,
+        dropped_after_ns=dropped_after_ns,
         replan=context.is_boundary and replans,
         drop_later_after_ns=unengaged.drop_after_ns,
         unsafe_to_climb=unengaged.unsafe_to_climb,
@@ -153,9 +157,9 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
     )
 
 
-def _drop_after(history: FilterHistory, clean_ns: int) -> FilterHistory:
-    """Drop what was captured after `clean_ns` and believed."""
-    return drop_samples(history, lambda sample: read_capture_ns(sample) > clean_ns)
+def _drop_after(history: FilterHistory, dropped_after_ns: int) -> FilterHistory:
+    """Drop what was captured after a time and believed."""
+    return drop_samples(history, lambda sample: read_capture_ns(sample) > dropped_after_ns)
 
 
 def _judge_inertial(state: ControlState, view: FilterView, context: TickContext) -> Verdict:
@@ -202,13 +206,13 @@ def _is_return_ordered(state: ControlState, view: FilterView, context: TickConte
 def _watch_flight(
     state: ControlState, view: FilterView, measured: Measured, context: TickContext, return_ordered: bool
 ) -> tuple[MonitorState, Verdict]:
-    """Watch the vehicle's motion, as long as it is we who fly; return the verdict that releases it."""
+    """Watch the vehicle's motion, as long as it is we who fly; return the verdict that ends its flight on plans."""
     monitors, verdict = _update_engaged(state, view, measured, context, return_ordered)
     # No plan will be flown on them, and who waits in the air lands.
     if (
         context.mode is ControlMode.WAIT
         and measured.samples.all_absurd
-        and context.is_ours
+        and context.is_controllable
         and context.controller.envelope is not None
     ):
         verdict = _ABSURD
@@ -219,9 +223,9 @@ def _update_engaged(
     state: ControlState, view: FilterView, measured: Measured, context: TickContext, return_ordered: bool
 ) -> tuple[MonitorState, Verdict]:
     bounds, before = context.controller.envelope, state.monitors
-    if before.release is not None:
+    if before.breach is not None:
         return before.engaged, NO_VERDICT
-    if bounds is None or not context.is_flown or not context.is_ours:
+    if bounds is None or not context.was_in_control or not context.is_controllable:
         return INITIAL, NO_VERDICT
     reading = measured.inertial
     observation = observe_motion(
@@ -254,9 +258,9 @@ def _judge_prediction(state: ControlState, monitors: MonitorState, view: FilterV
 def _judge_sources(measured: Measured, context: TickContext) -> Verdict:
     """Judge whether positions may be believed any more, while we fly."""
     samples = measured.samples
-    if not context.is_flown or not (samples.source_moved or samples.all_absurd):
+    if not context.was_in_control or not (samples.source_moved or samples.all_absurd):
         return NO_VERDICT
-    return release(EventCode.SOURCE_MOVED if samples.source_moved else EventCode.POSITIONS_ABSURD, "")
+    return end_plans(EventCode.SOURCE_MOVED if samples.source_moved else EventCode.POSITIONS_ABSURD, "")
 
 
 def _judge_plan(
@@ -328,7 +332,7 @@ def _watch_unengaged(state: ControlState, view: FilterView, measured: Measured, 
     """Watch the positions of an armed vehicle that others fly."""
     vehicle, reading = context.inputs.vehicle, measured.inertial
     is_armed = vehicle is not None and vehicle.armed
-    if context.is_flown or not (is_armed or context.is_climbing_or_landing):
+    if context.was_in_control or not (is_armed or context.is_climbing_or_landing):
         return _Unengaged()
     monitors, verdict = _update_unengaged(state, measured, context)
     jumped, inconsistent = measured.restarted and context.is_climbing_or_landing, not verdict.is_none

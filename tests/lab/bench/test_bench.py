@@ -38,7 +38,7 @@ from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-from uavctl.smpc.hahn_stursberg.frozen import FROZEN
+from uavctl.smpc.hahn_stursberg.shortcut import FROZEN
 from uavctl.smpc.link import bernoulli
 
 WANTED = {

@@ -25,7 +25,7 @@ from uavctl.lab.campaign.draws import draw
 from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.records import Decision, Truth
 from uavctl.smpc.batch import BatchSmpc, Counts
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
 
 STEPS, DT_NS = 50, 1_000_000_000
 NEVER = 1e6  # [s], [m], [m/s]

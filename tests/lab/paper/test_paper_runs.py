@@ -36,7 +36,7 @@ from uavctl.lab.paper.runs import (
     is_in_ellipsoid,
 )
 from uavctl.smpc.batch import BatchSmpc, Decisions
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
 
 RUNS, STEPS, SEED = 20, 50, 3
 

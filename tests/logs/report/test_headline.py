@@ -244,7 +244,7 @@ def test_wind_beyond_the_vehicles_strength_carries_it_out(blown: FlightData) -> 
     sentence = [why for why in headline.reasons if "bias was at its bound" in why]
     assert bool(sentence) == bool(bound)
     assert blown.breach is not None
-    assert Cause.RELEASED in headline.causes
+    assert Cause.ENVELOPE in headline.causes
     (let_go,) = [why for why in headline.reasons if blown.breach.text in why]
     (breach_s,) = blown.seconds([blown.breach.at_ns])
     assert f"at {breach_s:.1f} s" in let_go

@@ -25,8 +25,8 @@ from uavctl.records import Decision, Plan, SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.late import add_late_designs, make_late_design
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
 

@@ -23,8 +23,8 @@ from uavctl.smpc.hahn_stursberg import exact as conic
 from uavctl.smpc.hahn_stursberg.components import decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, kappa, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.horizon import Horizon, make_horizon
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 

@@ -28,8 +28,8 @@ from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, find_relaxed
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.mean import RowKind
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 
 OK = SolveStatus.OPTIMAL
 

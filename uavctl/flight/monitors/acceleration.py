@@ -27,7 +27,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import MOTION_NS, describe_vector
 from uavctl.flight.monitors.observer import Observer, measure_size_mps2, remove_drag
-from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, release
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import VehicleMotion
 
 SCATTERED, OF = 3, 5  # clipped innovations among the last ones that are no chance
@@ -76,9 +76,9 @@ def update(state: AccelerationState, observation: PositionObservation) -> tuple[
     clipped = (*state.clipped, observation.is_clipped)[-OF:]
     state = AccelerationState(beside_sent_mps2, ratio, clipped, is_pushed, over_ns)
     if over_ns is not None and (ratio >= PLAIN or observation.at_ns - over_ns >= PERSISTS_NS):
-        return state, release(EventCode.RESPONSE, _describe_response(unexplained, observation))
+        return state, end_plans(EventCode.RESPONSE, _describe_response(unexplained, observation))
     if sum(clipped) >= SCATTERED:
-        return state, release(EventCode.SCATTER, "positions leap about by more than the vehicle can move")
+        return state, end_plans(EventCode.SCATTER, "positions leap about by more than the vehicle can move")
     return state, NO_VERDICT
 
 

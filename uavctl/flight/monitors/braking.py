@@ -15,7 +15,7 @@ import msgspec
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import read_vehicle_velocity
-from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, release
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 
 SHOWS_NS = 1_000_000_000  # time after which braking must have shown
 BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of the first one, and this more
@@ -46,4 +46,4 @@ def update(state: BrakingState, observation: TickObservation) -> tuple[BrakingSt
     if tick.at_ns - since_ns < SHOWS_NS or speed_mps <= BRAKED * began_mps + BRAKED_MPS:
         return state, NO_VERDICT
     text = f"braking does not brake: {began_mps:.1f} m/s then, {speed_mps:.1f} m/s now"
-    return state, release(EventCode.BRAKING, text)
+    return state, end_plans(EventCode.BRAKING, text)

@@ -17,7 +17,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.fallback import FallbackParameters, compute_stop_m
 from uavctl.flight.limits import AXES, LimitsParameters
 from uavctl.flight.monitors.observation import EnvelopeParameters
-from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, release
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vec3
 
 MAX_OVERDUE_ANSWERS = 3  # plans that took longer than a tick: one may be the computer's fault
@@ -63,7 +63,7 @@ def update(state: ExternalState, observation: AnswerObservation) -> tuple[Extern
         f"the controller {observation.name} is too late: its plan took {took_ns * 1e-9:.3f} s, "
         f"a tick has {tick_ns * 1e-9:g} s{times}"
     )
-    return ExternalState(late, fault), release(EventCode.CONTROLLER_LATE, fault)
+    return ExternalState(late, fault), end_plans(EventCode.CONTROLLER_LATE, fault)
 
 
 def judge_wall(observation: WallObservation) -> Verdict:
@@ -94,5 +94,5 @@ def judge_wall(observation: WallObservation) -> Verdict:
                     f"the controller {observation.name} flies at the limit of {axis}: braking from {outward:.1f} m/s "
                     f"would end {beyond_m:.1f} m beyond it"
                 )
-                return release(EventCode.CONTROLLER_WALL, text)
+                return end_plans(EventCode.CONTROLLER_WALL, text)
     return NO_VERDICT

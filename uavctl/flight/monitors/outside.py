@@ -17,7 +17,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.limits import AXES
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation
-from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, release
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 
 LASTS_NS = 100_000_000  # one estimate alone may be a late sample's fault
 RETURNS_MPS = 0.3  # a vehicle outside that moves so fast towards the limit is on its way back
@@ -37,7 +37,7 @@ def update(state: OutsideState, observation: TickObservation) -> tuple[OutsideSt
         return OutsideState(), NO_VERDICT
     since_ns = state.since_ns or observation.tick.at_ns
     lasts = observation.tick.at_ns - since_ns >= LASTS_NS
-    return OutsideState(since_ns), release(EventCode.OUTSIDE, text) if lasts else NO_VERDICT
+    return OutsideState(since_ns), end_plans(EventCode.OUTSIDE, text) if lasts else NO_VERDICT
 
 
 def is_outside(observation: Observation, parameters: EnvelopeParameters) -> bool:

@@ -25,7 +25,7 @@ from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import PositionObservation, TickObservation, find_distance
 from uavctl.flight.monitors.observation import EnvelopeParameters, describe_vector
-from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, release
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vector
 
 PERSISTS_NS = 100_000_000  # time for which a difference has to last, over two positions at least
@@ -88,11 +88,11 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     plain = observation.is_hinted or apart_mps >= PLAIN * parameters.disagreement_mps
     if apart_ns is not None and (plain or at_ns - apart_ns >= PERSISTS_NS):
         text = f"positions move otherwise than the vehicle itself says, by {describe_vector(apart)} m/s"
-        return state, release(EventCode.VELOCITY, text)
+        return state, end_plans(EventCode.VELOCITY, text)
     if drift is not None:
         s, off = drift
         text = f"positions have come {describe_vector(off)} m away from the vehicle's own way in {s:.0f} s"
-        return state, release(EventCode.VELOCITY, text)
+        return state, end_plans(EventCode.VELOCITY, text)
     return state, NO_VERDICT
 
 
@@ -106,7 +106,7 @@ def update_silence(state: VelocityState, observation: TickObservation) -> tuple[
     if state.apart_ns is None or at_ns - state.apart_ns < UNRESOLVED_NS:
         return state, NO_VERDICT
     text = "positions moved otherwise than the vehicle itself says, and none has come since"
-    return state, release(EventCode.VELOCITY, text)
+    return state, end_plans(EventCode.VELOCITY, text)
 
 
 def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:

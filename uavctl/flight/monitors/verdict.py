@@ -20,7 +20,7 @@ class Action(Enum):
     DISTRUST_INERTIAL = auto()  # use no inertial data from `since_ns` on
     DISTRUST_VEHICLE_VELOCITY = auto()  # neither brake on the vehicle's own velocity nor compare with it
     BRAKE = auto()  # fly no plan until the cause is gone
-    RELEASE = auto()  # never fly a plan again in this flight
+    END_PLANS = auto()  # never fly a plan again in this flight
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -40,9 +40,9 @@ class Verdict(msgspec.Struct, frozen=True):
 NO_VERDICT = Verdict()
 
 
-def release(cause: EventCode, text: str) -> Verdict:
+def end_plans(cause: EventCode, text: str) -> Verdict:
     """Make the verdict that ends a flight on plans."""
-    return Verdict(Action.RELEASE, cause, text)
+    return Verdict(Action.END_PLANS, cause, text)
 
 
 def brake(cause: EventCode, text: str) -> Verdict:

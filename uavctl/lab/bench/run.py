@@ -39,8 +39,8 @@ from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
-from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutSolver
 from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
+from uavctl.smpc.hahn_stursberg.shortcut import FROZEN, ShortcutSolver
 from uavctl.smpc.sets import Polytope
 
 _N_COVARIANCES = 7  # in turns: the covariance of a filter changes at each decision

@@ -44,7 +44,7 @@ from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, Seque
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.smpc.estimate import innovation_form
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import SilencePlanner, make_answer
 from uavctl.smpc.pid import CascadedPid, PidGains, tune

@@ -30,7 +30,7 @@ from uavctl.lab.campaign.pool import open_processes
 from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
+from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 

@@ -342,7 +342,7 @@ class RegulatedRows:
         sides: Array,
         hold: Array | None,
         first: tuple[Array, Array] | None,
-        tightening: Array | None = None,
+        input_reduction: Array | None = None,
     ) -> tuple[Array, Array]:
         """Return the margin of the state rows (H, m) and of the hard rows.
 
@@ -361,8 +361,8 @@ class RegulatedRows:
         )
         margin_x += sides
         hard += self._hard_sides
-        if tightening is not None:
-            hard[self._input_rows] -= tightening[self._row_u]
+        if input_reduction is not None:
+            hard[self._input_rows] -= input_reduction[self._row_u]
         if hold is not None:
             hard -= self._hold_map @ hold
         if first is None:
