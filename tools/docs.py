@@ -41,7 +41,7 @@ lead of the vehicle's own reference in position and in velocity, and integral wi
 n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
 
 A file needs `[plant]`, `[sets]` and `[cost]`; what it leaves out has a default, or follows from these: the target is
-the origin (the middle where that is outside), the last gate is as wide as the inputs' limits, a camera sends a
+the origin (the middle where that is outside), the setpoint limiter is as wide as the inputs' limits, a camera sends a
 position each Δt. The name is that of the file. A plant of model `matrices` without `axes` is one of states that mean
 nothing in a room: `solve`, `design`, `campaign` and `uavctl.simulate` take it, flights do not.
 

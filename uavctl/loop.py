@@ -79,6 +79,8 @@ CONSOLE_CODES = frozenset(
         EventCode.STAMP_UNIT,
     }
 )  # codes of events that the console shows
+FROZEN_TEXT = "the camera repeats its position although the vehicle moves; its positions count as lost"
+FROZEN_PAUSE_NS = 3_000_000_000  # without frozen positions: the next ones are a new series
 INCONSISTENT_HOLD_NS = 3_000_000_000  # time in which positions are held back after such a contradiction
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
@@ -138,6 +140,7 @@ class ControlLoop:
         self._orders: deque[Command] = deque()
         self._external_solve_ns = 0  # time that a controller of another package took in the last tick
         # Last time at which positions contradicted the vehicle's climb or landing; None before.
+        self._frozen_ns: int | None = None  # the last tick with frozen positions
         self._position_inconsistent_ns: int | None = None
         self._is_handover_failed = False  # not even the hand-over works any more: positions are all that is sent
         self._last_setpoint_ns: int | None = None  # the last setpoint that flew the vehicle
@@ -279,6 +282,7 @@ class ControlLoop:
         self.account.breach_reason = self.breach_reason
         self.account.update_vehicle(at_ns, self._vehicle)
         self.account.add_decision(output.decision, output.events, has_estimate=output.estimate is not None)
+        self._notice_frozen_positions(output, notices)
         self._relay_positions(inputs, output, send, notices)
         answers = self._update_handover(inputs, output, send, notices)
         self.account.is_over = self.finished
@@ -293,6 +297,14 @@ class ControlLoop:
             notices=tuple(notices),
             step_ns=step_ns,
         )
+
+    def _notice_frozen_positions(self, output: TickOutput, notices: list[Event]) -> None:
+        """Notice positions that begin to repeat; each series of them once."""
+        for event in output.events:
+            if event.code == EventCode.SAMPLE_FROZEN:
+                if self._frozen_ns is None or event.at_ns - self._frozen_ns >= FROZEN_PAUSE_NS:
+                    notices.append(replace(event, text=FROZEN_TEXT))
+                self._frozen_ns = event.at_ns
 
     def _relay_positions(self, inputs: StepInput, output: TickOutput, send: Send, notices: list[Event]) -> None:
         """Pass positions on to the vehicle, but those that contradict its climb or landing."""

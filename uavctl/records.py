@@ -129,13 +129,13 @@ class Plan(Record, frozen=True, kw_only=True):
 
 
 class Setpoint(Record, frozen=True, kw_only=True):
-    """Setpoint sent to the vehicle, after the last gate."""
+    """Setpoint sent to the vehicle, after the setpoint limiter."""
 
     at_ns: int
     accel_mps2: Vec3
     yaw_rad: float | None = None
     source: SetpointSource
-    limited: tuple[str, ...] = ()  # what the last gate changed, by name
+    limited: tuple[str, ...] = ()  # what the setpoint limiter changed, by name
 
 
 class Decision(Record, frozen=True, kw_only=True):
@@ -151,7 +151,7 @@ class Decision(Record, frozen=True, kw_only=True):
     plan_seq: int | None
     plan_index: int | None
     solve: SolveStatus | None  # ending of this tick's solve, if there was one
-    input: Vector | None  # (n_u,), in the plant's input units, after the last gate
+    input: Vector | None  # (n_u,), in the plant's input units, after the setpoint limiter
     fresh: int  # fresh samples in a row since the last fallback
     missed_ticks: int
     accepted: int  # samples taken in this tick

@@ -62,7 +62,7 @@ class SetpointPlot(Record, frozen=True, kw_only=True):
     """Acceleration setpoint that was sent [m/s²]."""
 
     accel_mps2: Axes
-    limited: bool  # the last gate changed it
+    limited: bool  # the setpoint limiter changed it
     source: str
 
 

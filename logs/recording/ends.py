@@ -32,7 +32,7 @@ def create_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[P
     """Yield the path of a new recording, with room checked; folders made for it are removed if they stay empty.
 
     Raises:
-        RecordingError: as `check_room` does.
+        RecordingError: as `check_free_space` does.
     """
     path = make_recording_path(out, name)
     with remove_empty_folders([path]):

@@ -59,8 +59,8 @@ _STAGES = {
     "/uavctl/estimate": "the tick was given the same: estimator, or how far positions are believed",
     "/uavctl/link_estimate": "the tick was given the same: what is believed of the link",
     "/uavctl/plan": "the estimate is the same: design, target or solver",
-    DECISION: "estimate and plan (if there is a new one) are the same: a rule of the decision, fallback or last gate",
-    "/uavctl/setpoint": "the decision is the same: hand-over or last gate",
+    DECISION: "estimate and plan (if new) are the same: a rule of the decision, fallback or setpoint limiter",
+    "/uavctl/setpoint": "the decision is the same: hand-over or setpoint limiter",
     "/uavctl/event": "nothing before it differs: what is told",
     "/uavctl/link": "nothing before it differs: counters or clock of a connection",
 }

@@ -100,7 +100,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/estimate", Estimate, "state estimate of a tick"),
     Topic("/uavctl/plan", Plan, "answer of the predictive controller, when one was made"),
     Topic("/uavctl/decision", Decision, "what a tick chose, and why"),
-    Topic("/uavctl/setpoint", Setpoint, "acceleration setpoint after the last gate"),
+    Topic("/uavctl/setpoint", Setpoint, "acceleration setpoint after the setpoint limiter"),
     Topic("/uavctl/vehicle", VehicleStatus, "the vehicle's mode and state, as it tells"),
     Topic("/uavctl/event", Event, "something worth telling a person"),
     Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),

@@ -208,7 +208,7 @@ class FlightEvidence:
         return float(distances_m[np.isfinite(distances_m)].max(initial=0.0))
 
     def count_limited(self) -> tuple[float, float, list[tuple[str, float]]]:
-        """Return the share of the setpoints that the last gate changed, when first [s], and the shares by name."""
+        """Return the share of setpoints that the limiter changed, when first [s], and the shares by name."""
         setpoints = self.flight.setpoints
         limited_setpoints = [setpoint for setpoint in setpoints if setpoint.limited]
         if not limited_setpoints:

@@ -62,11 +62,12 @@ def _describe_estimate_error(e: FlightEvidence, worst: Excursion) -> str | None:
 
 
 def _describe_gate(e: FlightEvidence) -> Iterator[str]:
-    """Return a sentence on setpoints that the last gate changed, if these were more than a few."""
+    """Return a sentence on setpoints that the setpoint limiter changed, if these were more than a few."""
     share, first_s, kinds = e.count_limited()
     if share > _GATE_SHARE:
         names = ", ".join(f"{name} {100 * part:.0f} %" for name, part in kinds)
-        yield f"The last gate limited {100 * share:.0f} % of the setpoints ({names}), first at {seconds(first_s)}."
+        first = seconds(first_s)
+        yield f"The setpoint limiter changed {100 * share:.0f} % of the setpoints ({names}), first at {first}."
 
 
 def _describe_bias(e: FlightEvidence) -> Iterator[str]:

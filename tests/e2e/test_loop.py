@@ -67,6 +67,18 @@ class LoopRig:
         self.loop.receive("vehicle", message.pack(self._mav), self.tick * TICK_NS + late_ns)
 
 
+@pytest.mark.fault(14)
+def test_row_14_positions_that_freeze_are_noticed_once_in_a_series() -> None:
+    faults = 'sim.fault=[{at_s=3.0, kind="frozen", for_s=1.0}, {at_s=12.0, kind="frozen", for_s=1.0}]'
+    rig, noticed = LoopRig(faults), []
+    for tick in range(16 * 20):
+        rig.run(1)
+        noticed += [tick / 20 for code in rig.notices if code == EventCode.SAMPLE_FROZEN]
+    frozen = [event.at_ns * 1e-9 for event in rig.memory.of(Event) if event.code == EventCode.SAMPLE_FROZEN]
+    assert len(frozen) > len(noticed) > 0 and noticed[0] == pytest.approx(min(frozen))
+    assert [sum(begin <= at_s < begin + 3.0 for at_s in noticed) for begin in (3.0, 12.0)] == [1, 1]
+
+
 def is_stream_request(message: Any) -> bool:
     return bool(message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)
 

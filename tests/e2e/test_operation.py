@@ -22,6 +22,7 @@ from sim_rig import decode
 
 from logs.recording.reader import records
 from uavctl.config import load_config
+from uavctl.daemon.engagement import compute_stop_limit_s
 from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 
@@ -264,8 +265,8 @@ def test_a_unit_of_systemd_s_comes_with_the_package() -> None:
     # Where its user's processes look for locks, and where a killed daemon's word stays.
     assert (lines["RuntimeDirectory"], lines["RuntimeDirectoryMode"]) == ("uavctl", "0700")
     assert lines["RuntimeDirectoryPreserve"] == "yes"
-    config = load_config("room-hahn-stursberg")
-    assert float(lines["TimeoutStopSec"]) > config.fallback.brake_s + config.fallback.hold_s + 10.0
+    config = load_config("room-px4", ["relay.enabled=true"])
+    assert float(lines["TimeoutStopSec"]) > compute_stop_limit_s(config, takes_off=False)
 
 
 def test_options_of_ctl_are_checked() -> None:

@@ -98,7 +98,7 @@ def test_transitions(
 @pytest.mark.parametrize(
     ("reason", "after_ns", "sent_mps2", "wanted"),
     [
-        (STOP, S // 20, (0.0, 0.0, -0.25), HOLD),  # the last gate has not let the zero through yet
+        (STOP, S // 20, (0.0, 0.0, -0.25), HOLD),  # the setpoint limiter has not let the zero through yet
         (STOP, S // 20, (0.0, 0.0, 0.0), LAND),
         (TO_LAND, S - 1, (0.1, 0.0, 0.0), HOLD),
         (TO_LAND, S, (0.1, 0.0, 0.0), LAND),  # it is not waited for for ever

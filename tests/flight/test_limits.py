@@ -1,4 +1,4 @@
-"""The last gate: what comes out is finite, bounded and slew-limited, whatever goes in."""
+"""The setpoint limiter: what comes out is finite, bounded and slew-limited, whatever goes in."""
 
 from __future__ import annotations
 

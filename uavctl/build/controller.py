@@ -177,8 +177,8 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
     """Build the design of the scheme with risk conditioned on the age.
 
     Args:
-        for_flight: Whether the flight's filter estimates, biases included, and the last gate limits the slew of the
-            inputs; a campaign has neither.
+        for_flight: Whether the flight's filter estimates, biases included, and the setpoint limiter bounds the inputs'
+            slew; a campaign has neither.
         cov: Covariance (n_x, n_x) of the estimate's error after a position without losses, in a campaign; None: as
             configured.
 
@@ -335,7 +335,7 @@ def _compute_bias_bounds(config: Config) -> tuple[float, ...]:
 
 
 def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
-    """Build the bounds of possible motion in flight, by the limits, the plant and the last gate."""
+    """Build the bounds of possible motion in flight, by the limits, the plant and the setpoint limiter."""
     envelope, limits, position_limits = config.envelope, config.limits, get_position_limits_m(config)
     lower, upper = map(list, zip(*(position_limits.get(axis, (-math.inf, math.inf)) for axis in AXES), strict=True))
     sizes_m = [high - low for low, high in zip(lower, upper, strict=True)]

@@ -197,7 +197,7 @@ def fly(
     /,
     *,
     duration: Annotated[
-        float | None, Parameter(help="hand over after this time [s]; else fly on", validator=SPAN_S)
+        float | None, Parameter(help="brake and land after this time [s]; else fly on", validator=SPAN_S)
     ] = None,
     arm: Annotated[bool, Parameter(negative=(), help="the vehicles may be armed; needs --takeoff")] = False,
     takeoff: TakeOff = None,

@@ -59,7 +59,7 @@ def fly(
     vehicle: Annotated[str | None, Parameter(help="URL of the vehicle; else daemon.vehicle")] = None,
     mocap: Mocap = None,
     duration: Annotated[
-        float | None, Parameter(help="hand over after this time [s]; else fly on", validator=SPAN_S)
+        float | None, Parameter(help="brake and land after this time [s]; else fly on", validator=SPAN_S)
     ] = None,
     arm: Annotated[bool, Parameter(negative=(), help="the vehicle may be armed; needs --takeoff")] = False,
     takeoff: TakeOff = None,
@@ -77,7 +77,9 @@ def fly(
 ) -> int:
     """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C brakes, then lands it.
 
-    Ctrl-C and the end of --duration brake and hold; then the vehicle lands, or the pilot takes it (`fallback.land`).
+    Ctrl-C and the end of --duration brake and hold. Then the vehicle's own landing is requested (`fallback.land`; else
+    the pilot takes the vehicle). The program ends once that landing has begun; after --takeoff, or where it passes
+    positions on to the vehicle, once the vehicle is disarmed. A second Ctrl-C ends it at once, without landing.
     With --arm --takeoff HEIGHT the vehicle on the ground is armed, climbs by itself, and is flown from there.
 
     Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot
@@ -118,7 +120,7 @@ def fly_daemon(
         loaded: The configuration and its source.
         take_off_m: Height of the climb above the ground [m]; None leaves arming and modes to the pilot.
         goto: Whether the mission is the place of `--goto`.
-        duration_s: Hand over after this time [s]; None flies on.
+        duration_s: Brake and land after this time [s]; None flies on.
         out: Folder of the recording; None makes a new one below `flights/`.
         control: Folder of the socket for orders; None: the user's folder.
         realtime: SCHED_FIFO and locked memory, as far as permitted.

@@ -131,7 +131,7 @@ def _limit_inputs(
     accel_mps2: float,
     written: dict[str, str],
 ) -> None:
-    """Limit the inputs of the level axes, and the last gate's setpoints along them."""
+    """Limit the inputs of the level axes, and the setpoint limiter's setpoints along them."""
     sets, accel_limits = table["sets"], table.setdefault("limits", {}).setdefault("accel_mps2", [accel_mps2] * 3)
     scales = plant.get("accel_per_input") or [1.0] * len(index)
     for side, sign in (("lower", -1.0), ("upper", 1.0)):

@@ -389,13 +389,16 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
         Meta(
             ge=0.001,
             le=1e6,
-            description="a position further from the prediction than this many standard deviations, gate_m, and what "
-            "inputs can have done since the newest one, counts as lost; a position that repeats is frozen once the "
-            "prediction by inputs alone is as far from it",
+            description="number of standard deviations of two tests. A position further from the prediction than "
+            "these, gate_m and what inputs can have done since the newest one counts as lost. A value that repeats is "
+            "frozen once the prediction by inputs alone is further from it than these, gate_m and its resolution",
         ),
     ] = 6.0
     gate_m: Annotated[
-        float, Meta(ge=0, le=1e6, description="margin of that for what the model does not know, as gusts [m]")
+        float,
+        Meta(
+            ge=0, le=1e6, description="distance that both tests of gate_sigma allow beside it: gusts, for example [m]"
+        ),
     ] = 0.3
     bias_drift: Annotated[
         float,
@@ -423,7 +426,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
             le=1,
             description="share of each input's half range (sets.input_lower, input_upper) that may be spent against "
             "it, bias_max at least: beyond bias_max the vehicle still comes to its target, while plans at their "
-            "limits are cut by the last gate",
+            "limits are cut by the setpoint limiter",
         ),
     ] = 0.0
     inertial_std_mps2: Annotated[
@@ -487,7 +490,7 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
 
 
 class LimitsConfig(Section, frozen=True, kw_only=True):
-    """The last gate on a setpoint."""
+    """The setpoint limiter on a setpoint."""
 
     accel_mps2: Annotated[
         Position, Meta(description="largest acceleration setpoint of each axis, north, east, down [m/s²]")

@@ -1,1 +1,1 @@
-"""One control tick, pure: estimator, fallback, last gate."""
+"""One control tick, pure: estimator, fallback, setpoint limiter."""

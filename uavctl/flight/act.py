@@ -1,8 +1,8 @@
-"""Phase 5 of a tick: pass the setpoint through the last gate, and note the input in the filter.
+"""Phase 5 of a tick: pass the setpoint through the setpoint limiter, and note the input in the filter.
 
 1. A plan gives its input of this step. The fallback gives braking, the acceleration of HOLD, and the way back.
-2. The limiter bounds and slew-limits it. After a breach of the envelope the vehicle is level at once: slewing would be
-   flown on data that cannot be believed.
+2. The setpoint limiter bounds and slew-limits it. After a breach of the envelope the vehicle is level at
+   once: slewing would be flown on data that cannot be believed.
 3. The input acts in the filter from now on, or after the dead time. While the vehicle takes no setpoints others fly.
 4. Positions that a monitor distrusts while the vehicle climbs or lands at our request are dropped, from the next tick
    on.
@@ -63,7 +63,7 @@ def act(
 def _make_setpoint(
     state: ControlState, context: TickContext, supervised: Supervised, decided: Decided
 ) -> tuple[Setpoint | None, Array | None]:
-    """Make the setpoint after the last gate, and the input (n_u,) that it is."""
+    """Make the setpoint after the setpoint limiter, and the input (n_u,) that it is."""
     controller, source, fallback, plan = context.controller, _SOURCES.get(decided.mode), decided.fallback, decided.plan
     nothing_known = supervised.view.estimate is None and fallback is None
     if decided.sends_nothing or source is None or nothing_known:

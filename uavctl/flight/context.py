@@ -21,7 +21,7 @@ from uavctl.flight.state import ControlState
 from uavctl.records import ControlMode, Estimate, PositionSample, StepInput, Vec3, Vector, VehicleStatus
 from uavctl.smpc.plant import Plant
 
-_NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # modes in which others fly
+_NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # modes in which the controller does not fly
 
 
 class TickContext(msgspec.Struct, frozen=True, eq=False):
@@ -29,14 +29,14 @@ class TickContext(msgspec.Struct, frozen=True, eq=False):
 
     inputs: StepInput
     controller: Controller
-    is_climbing_or_landing: bool  # whether the vehicle is on its way up or down at our request
+    is_climbing_or_landing: bool  # whether the vehicle climbs or lands by itself, as the hand-over requested
     step: int  # k
     boundary_ns: int  # when step k began [ns]
     is_boundary: bool  # whether this is the first tick of its step that runs
     mode: ControlMode  # mode of the tick before
-    was_in_control: bool  # whether we flew in the tick before
+    was_in_control: bool  # whether the controller flew the vehicle in the tick before
     not_ready_reason: str  # why the vehicle takes no setpoints; empty if it does
-    is_controllable: bool  # whether the vehicle is in the air and takes setpoints, as far as it is known
+    is_controllable: bool  # whether the vehicle is known to be in the air and to take setpoints
 
     @property
     def at_ns(self) -> int:

@@ -33,7 +33,7 @@ class Controller:
     names: Names  # names of the rows and states in events
     estimator: EstimatorParameters  # parameters of the filter
     fallback: FallbackParameters  # parameters of the fallback
-    limits: LimitsParameters  # parameters of the last gate
+    limits: LimitsParameters  # parameters of the setpoint limiter
     position_gate: GateParameters  # parameters of the gate for positions
     dt_ns: int  # Δt [ns]
     tick_ns: int  # time between ticks [ns]; divides Δt

@@ -52,6 +52,7 @@ class Decided(msgspec.Struct, frozen=True, eq=False):
     """Result of phase 4: what flies, with the reason."""
 
     plan: Plan | None
+    superseded_after_ns: int | None  # a position that was captured after this time supersedes the plan
     fallback: Fallback | None
     mission: MissionState | None
     order: Command | None  # order that still waits for a plan
@@ -109,7 +110,8 @@ def _begin(phase: _Phase, ordered: Ordered) -> Decided:
     if phase.context.inputs.stop:
         fallback = request_fallback(fallback, FallbackReason.STOP, at_ns)
     return Decided(
-        plan=_mark_plan_outdated(state.plan.flown, supervised),
+        plan=state.plan.flown,
+        superseded_after_ns=_find_superseded_after_ns(state, supervised),
         fallback=fallback,
         mission=state.mission.progress,
         order=ordered.order,
@@ -121,19 +123,20 @@ def _begin(phase: _Phase, ordered: Ordered) -> Decided:
     )
 
 
-def _mark_plan_outdated(plan: Plan | None, supervised: Supervised) -> Plan | None:
-    """Return the plan that flies. If its samples were dropped, its capture time is moved before the estimate's.
+def _find_superseded_after_ns(state: ControlState, supervised: Supervised) -> int | None:
+    """Find the capture time after which a position supersedes the plan that flies.
 
-    A plan is replaced once the estimate has a newer capture time. So a plan from dropped samples is replaced at the
-    next boundary, and for some steps after it (`replan`): the slew-limited setpoint is far from the new plan's start.
+    A plan from dropped samples is superseded by the estimate of this tick. So it is for some steps (`replan`): the
+    slew-limited setpoint is still far from where the new plan begins.
     """
-    if plan is None:
+    superseded_after_ns, dropped_after_ns = state.plan.superseded_after_ns, supervised.dropped_after_ns
+    if superseded_after_ns is None:
         return None
     if supervised.replan:
-        return replace(plan, captured_ns=plan.captured_ns - 1)
-    if supervised.dropped_after_ns is None or plan.captured_ns <= supervised.dropped_after_ns:
-        return plan
-    return replace(plan, captured_ns=supervised.dropped_after_ns - 1)
+        return superseded_after_ns - 1
+    if dropped_after_ns is None or superseded_after_ns <= dropped_after_ns:
+        return superseded_after_ns
+    return dropped_after_ns - 1
 
 
 def _update_biases(phase: _Phase) -> Biases:
@@ -228,7 +231,8 @@ def _plan_from(begun: Decided, belief: Belief, phase: _Phase) -> Decided:
 def _replan(begun: Decided, mission: MissionState, base: Estimate, cov: Array, phase: _Phase) -> Decided:
     """Ask for a plan if there is a new measurement, as ordered; else, or if that fails, the old one plays out."""
     controller, context = phase.controller, phase.context
-    new_measurement = begun.plan is None or base.captured_ns > begun.plan.captured_ns
+    before_ns = None if begun.plan is None else begun.superseded_after_ns
+    new_measurement = before_ns is None or base.captured_ns > before_ns
     if not new_measurement and not _has_new_inertial(begun.plan, phase):
         return replace(begun, reason="no news: the plan plays out")
     reason = "news: a new plan" if new_measurement else "inertial data: a new plan"
@@ -244,7 +248,14 @@ def _replan(begun: Decided, mission: MissionState, base: Estimate, cov: Array, p
     if asked.plan is None:
         reason = "no new plan: the old one plays out"
         return replace(begun, reason=reason, fault=asked.fault, trouble=asked.text)
-    return replace(begun, plan=asked.plan, fallback=None, new_plan=asked.plan, reason=reason)
+    return replace(
+        begun,
+        plan=asked.plan,
+        superseded_after_ns=asked.plan.captured_ns,
+        fallback=None,
+        new_plan=asked.plan,
+        reason=reason,
+    )
 
 
 def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phase) -> Preview:

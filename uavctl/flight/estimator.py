@@ -68,7 +68,7 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
 
     origin_ns: int  # A boundary of the Δt grid [ns]
     window_begin_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
-    anchor: FilterState  # state of the filter at the horizon
+    anchor: FilterState  # state of the filter at the begin of the window
     entries: tuple[FilterEvent, ...] = ()  # entries since then, sorted by key
     states: list[FilterState] = []  # states of the filter after the first entries, as far as they are known
 

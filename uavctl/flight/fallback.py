@@ -30,7 +30,7 @@ from enum import IntEnum, auto
 from uavctl.flight.limits import ZERO
 from uavctl.records import ControlMode, Vec3
 
-SETTLE_S = 1.0  # longest time in which the last gate reaches zero
+SETTLE_S = 1.0  # longest time in which the setpoint limiter reaches zero
 STILL_MPS = 0.02  # below this speed the vehicle is at rest
 DRIFT_MPS = 0.15  # above this speed, by its own velocity, a vehicle that holds drifts
 CALM_MPS2 = 0.04  # HOLD begins when the setpoint is this close to its own
@@ -134,7 +134,7 @@ def advance_fallback(
             held_ns = at_ns if fallback.held_ns is None else held_ns
             return replace(fallback, mode=ControlMode.HOLD, since_ns=at_ns, held_ns=held_ns)
         return fallback
-    # A vehicle keeps its last setpoint for a while: that one is HOLD's zero, once the last gate lets it through.
+    # A vehicle keeps its last setpoint for a while: that one is HOLD's zero, once the setpoint limiter lets it through.
     settled = fallback.is_final and (sent_mps2 == ZERO or elapsed_s >= SETTLE_S)
     if settled or due:
         after = _follow_hold(fallback.reason, parameters.land)

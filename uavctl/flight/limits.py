@@ -1,4 +1,4 @@
-"""The last gate on a setpoint: finite, bounded, slew-limited; knows nothing of what asked for it."""
+"""The setpoint limiter on a setpoint: finite, bounded, slew-limited; knows nothing of what asked for it."""
 
 from __future__ import annotations
 

@@ -72,6 +72,8 @@ class PlanGroup(msgspec.Struct, frozen=True, eq=False):
     """State of the plan."""
 
     flown: Plan | None = None  # the plan that is flown; None if none is
+    # A position that was captured after this time supersedes the plan; None without a plan
+    superseded_after_ns: int | None = None
     decided_step: int | None = None  # step of the last tick
     sent_mps2: Vec3 = ZERO  # the last setpoint
 

@@ -4,7 +4,7 @@
 2 supervise.py  run the monitors, turn their verdicts into actions
 3 orders.py     accept or refuse the operator's orders
 4 decide.py     make a new plan, continue the old one, or fall back
-5 act.py        pass the setpoint through the last gate, note the input in the filter
+5 act.py        pass the setpoint through the setpoint limiter, note the input in the filter
 6 events.py     events for people
 """
 
@@ -114,6 +114,7 @@ def _make_state(
         mission=MissionGroup(decided.mission, decided.order),
         plan=PlanGroup(
             flown=decided.plan,
+            superseded_after_ns=decided.superseded_after_ns,
             decided_step=context.step,
             sent_mps2=ZERO if acted.setpoint is None else acted.setpoint.accel_mps2,
         ),

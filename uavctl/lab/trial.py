@@ -188,8 +188,8 @@ FIGURE_NOTE = (
     "is to be held. To 0.3 m, to 0.1 m: from when on it stayed so near, counted from the first order. Tracking: "
     "distance from where the motion was to be at the time, mean and largest. Beyond wall: furthest beyond a limit of "
     "the position; negative is the room that was left; with a blackout, from its begin on. Limited: share of setpoints "
-    "that the last gate changed. Gave way: share of plans in which a constraint gave way. Fallback: share of ticks in "
-    "which no plan was flown."
+    "that the setpoint limiter changed. Gave way: share of plans in which a constraint gave way. Fallback: share of "
+    "ticks in which no plan was flown."
 )
 
 
@@ -303,7 +303,7 @@ class TrialFlight:
     tracking_m: float = math.nan  # distance from where the motion wanted it at the time, mean
     tracking_max_m: float = math.nan  # the largest
     blackout_beyond_m: float = math.nan  # furthest beyond a wall from a blackout's begin on
-    limited: float = math.nan  # share of setpoints that the last gate changed
+    limited: float = math.nan  # share of setpoints that the setpoint limiter changed
     gave_way: float = math.nan  # share of plans in which a constraint was relaxed
     fallback: float = math.nan  # share of ticks, from the first order on, in which no plan was flown
     positions: int = 0  # that arrived
@@ -336,7 +336,7 @@ class FlightCounts:
 
     first_target_ns: int | None = None  # time of the first decision with a target; None before
     setpoints: int = 0  # setpoints sent
-    limited: int = 0  # setpoints that the last gate changed
+    limited: int = 0  # setpoints that the setpoint limiter changed
     plans: int = 0
     gave_way: int = 0  # plans in which a constraint was relaxed
     ticks: int = 0  # ticks from the first such decision on

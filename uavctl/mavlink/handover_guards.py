@@ -34,10 +34,9 @@ LAND_PERIODS = 10  # multiples of `land_s` for which landing is requested: as lo
 NO_CLIMB_SHARE = 0.1  # share of the climb below which it has not begun
 MIN_CLIMB_SHARE = 0.3  # share of the climb that an ended climb must have reached
 TAKING_OFF = frozenset({HandoverState.MODE, HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
-_IN_PROGRESS = TAKING_OFF | {
-    HandoverState.RETURNING,
-    HandoverState.FAILSAFE,
-}  # in these states the operator's end of the flight also requests landing
+# Not yet engaged, or interrupted: the operator's end of the flight requests landing here. Once engaged, the controller
+# brakes first and then requests it.
+_IN_PROGRESS = TAKING_OFF | {HandoverState.RETURNING, HandoverState.FAILSAFE}
 _CLIMB_STATES = frozenset({HandoverState.CLIMBING, HandoverState.ENGAGING})
 REQUESTING = _IN_PROGRESS | {HandoverState.LANDING}
 BOOT_TIME_WAIT_NS = 5_000_000_000  # wait for the uptime of a vehicle that is armed at the start

@@ -18,7 +18,7 @@ from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.baselines import PacketisedPredictive
 from uavctl.smpc.batch import BatchSmpc
-from uavctl.smpc.conditioned.backoffs import RARE_SHARE, allocate_by_price, allocate_equally
+from uavctl.smpc.conditioned.backoffs import RARE_SHARE, allocate_by_age, allocate_equally
 from uavctl.smpc.conditioned.planner import MAX_SHIFT_ITERATIONS, METHOD, ConditionedDecider, ConditionedSolver
 from uavctl.smpc.link import bernoulli, gilbert_elliott
 from uavctl.smpc.nominal import ControlProblem, lqr
@@ -181,14 +181,14 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
 
 
 def test_the_weights_are_those_of_the_age() -> None:
-    risk = allocate_by_price(LINK, np.linspace(1.0, 3.0, 12), ALLOWED)
+    risk = allocate_by_age(LINK, np.linspace(1.0, 3.0, 12), ALLOWED)
     assert risk.age_probabilities == pytest.approx((1.0 - LOSS) * LOSS ** np.arange(12))
     assert risk.older_probability == pytest.approx(LOSS**12)
     assert risk.age_probabilities @ risk.budgets == pytest.approx(ALLOWED - LOSS**12)
     assert (np.diff(risk.budgets) >= 0.0).all()
     assert risk.budgets.max() <= 0.5
     bursts = gilbert_elliott(enter=0.1, leave=0.4, good_loss=0.05, bad_loss=0.9)
-    weights = allocate_by_price(bursts, np.ones(40), ALLOWED).age_probabilities
+    weights = allocate_by_age(bursts, np.ones(40), ALLOWED).age_probabilities
     older = [bursts.outage(age) for age in range(41)]
     assert weights == pytest.approx(-np.diff(older))
 
@@ -197,7 +197,7 @@ def test_the_weights_are_those_of_the_age() -> None:
 def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> None:
     """No shift of risk from one age to another lowers Σ π_t^h β_t."""
     sigma = np.array([0.4, 0.9, 1.5, 2.2, 3.0])
-    risk = allocate_by_price(bernoulli(np.array([0.6])), sigma, 0.08, price)
+    risk = allocate_by_age(bernoulli(np.array([0.6])), sigma, 0.08, price)
     priced = risk.age_probabilities**price
 
     def paid(budgets: Array) -> float:
@@ -216,7 +216,7 @@ def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> 
 def test_two_rows_that_share_the_risk_keep_no_rare_age_away() -> None:
     """At 10 % loss, ages of ten steps are all but never met: they take as much risk as rows can, in corners too."""
     rare = bernoulli(np.array([0.9]))
-    single, shared = (allocate_by_price(rare, np.linspace(0.4, 5.6, 12), ALLOWED, corner=n) for n in (1, 2))
+    single, shared = (allocate_by_age(rare, np.linspace(0.4, 5.6, 12), ALLOWED, n_binding=n) for n in (1, 2))
     for risk in (single, shared):
         assert risk.age_probabilities @ risk.budgets == pytest.approx(ALLOWED - risk.older_probability)
     assert single.budgets[-1] == pytest.approx(0.5)
@@ -230,7 +230,7 @@ def test_two_rows_that_share_the_risk_keep_no_rare_age_away() -> None:
 def test_in_transit_the_ages_share_equally_except_rare_ones() -> None:
     """Every age that keeps something back has the same risk, and all of what is allowed is used up."""
     for loss in (0.1, 0.3, 0.8):
-        risk = allocate_equally(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, corner=2)
+        risk = allocate_equally(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, n_binding=2)
         assert risk.age_probabilities @ risk.budgets == pytest.approx(ALLOWED - risk.older_probability)
         counts = np.isfinite(risk.shares)
         assert np.ptp(risk.budgets[counts]) == 0.0
@@ -271,7 +271,7 @@ def test_the_spread_of_a_plan_depends_on_the_target_alone(name: str) -> None:
 @pytest.mark.parametrize(("loss", "steps"), [(0.9, 12), (0.5, 3)])
 def test_a_horizon_shorter_than_silences_is_refused(loss: float, steps: int) -> None:
     with pytest.raises(DesignError, match=rf"smpc.horizon: positions are {steps} steps old or more in"):
-        allocate_by_price(bernoulli(np.array([1.0 - loss])), np.ones(steps), ALLOWED)
+        allocate_by_age(bernoulli(np.array([1.0 - loss])), np.ones(steps), ALLOWED)
 
 
 def test_a_state_that_no_input_reaches_is_refused() -> None:

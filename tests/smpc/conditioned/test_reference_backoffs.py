@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.tasks import Cell, make_tasks
-from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, allocate_by_price, compute_reference_backoffs, quantile
+from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, allocate_by_age, compute_reference_backoffs, quantile
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.estimate import innovation_form
@@ -31,7 +31,7 @@ def steps_for(loss: float) -> int:
 def distances(link: AgeModel, steps: int, cov: Array | None = None, slew_mps3: float = np.inf, most: int = 1) -> Array:
     case = replace(problem("paper"), horizon=steps)
     deviations = np.sqrt([EAST[0] @ item @ EAST[0] for item in propagate_covariance(case.plant, steps)[1:]])
-    risk = allocate_by_price(link, deviations, ALLOWED, corner=2)
+    risk = allocate_by_age(link, deviations, ALLOWED, n_binding=2)
     slew = SlewRows(case.plant, case.input_set, slew_mps3)
     return compute_reference_backoffs(case, risk, ALLOWED, slew, EAST, cov, most)
 
@@ -45,7 +45,7 @@ def test_the_share_of_new_plans_with_slack_is_the_design_share(loss: float, nois
     plant = case.plant
     cov = innovation_form(plant, 0.1, 0.0, 0).estimate_cov if noisy else np.zeros((4, 4))
     (d,) = distances(bernoulli(np.array([1.0 - loss])), steps, cov)[0]
-    risk = allocate_by_price(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
+    risk = allocate_by_age(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, n_binding=2)
     backoff = quantile(risk.shares) * sigma(steps, cov)
     gap = np.minimum(rng.geometric(1.0 - loss, draws), steps)
     spread = propagate_covariance(plant, steps, cov) - cov
@@ -78,7 +78,7 @@ def sigma(steps: int, cov: Array) -> Array:
 def test_in_bursts_rest_at_all_ages_is_outside_as_often_as_allowed() -> None:
     link = gilbert_elliott(enter=1.0 / 7.0, leave=1.0 / 3.0, good_loss=0.0, bad_loss=1.0)
     (d,) = distances(link, 20)[0]
-    risk = allocate_by_price(link, sigma(20, np.zeros((4, 4))), ALLOWED, corner=2)
+    risk = allocate_by_age(link, sigma(20, np.zeros((4, 4))), ALLOWED, n_binding=2)
     assert risk.age_probabilities @ norm.cdf(-d / sigma(20, np.zeros((4, 4)))) == pytest.approx(
         ALLOWED - risk.older_probability, rel=1e-6
     )
@@ -107,7 +107,7 @@ def test_late_positions_are_counted_from_their_capture() -> None:
         def outage(self, age: int) -> float:
             return self._on_time.outage(age - 1) if age else 1.0
 
-    risk = allocate_by_price(Late(), sigma(case.horizon, np.zeros((4, 4))), ALLOWED, corner=2)
+    risk = allocate_by_age(Late(), sigma(case.horizon, np.zeros((4, 4))), ALLOWED, n_binding=2)
     late = compute_reference_backoffs(case, risk, ALLOWED, SlewRows(case.plant, case.input_set, np.inf), EAST, None, 1)[
         0, 0
     ]

@@ -83,7 +83,7 @@ def judge_wall(observation: WallObservation) -> Verdict:
     )
     for axis, position, velocity, lower, upper, margin, lag_s, sent, most in rows:
         for out_m, outward, gains in ((lower - position, -velocity, -sent), (position - upper, velocity, sent)):
-            # The last gate takes its time until it asks for the opposite: v = v_0 + a² / 2 j, T = τ + (a + ½ a_max) / j
+            # The setpoint limiter takes time to ask for the opposite: v = v_0 + a² / 2 j, T = τ + (a + ½ a_max) / j
             gains = max(gains, 0.0)
             fastest = outward + gains * gains / (2.0 * slew)
             turn_s = lag_s + (gains + 0.5 * most) / slew

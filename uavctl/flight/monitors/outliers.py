@@ -34,8 +34,8 @@ _HORIZONS = 2  # the vehicle may be anywhere after that many horizons of silence
 class GateParameters:
     """Parameters of the gate for positions."""
 
-    sigma: float  # half-width of the set in standard deviations, beside what inputs can do
-    margin_m: float  # and beside both, for what no model says [m]
+    sigma: float  # half-width of the gate in standard deviations, beside what inputs can do
+    margin_m: float  # added half-width, for gusts and other disturbances that no model has [m]
     jump_ns: int  # time for which refused samples agree before the source has moved [ns]
     # Below this speed, by its own velocity, a vehicle may be where it was; 0 where its velocity proves nothing
     at_rest_mps: float = 0.0
@@ -73,7 +73,7 @@ class OutlierTrack:
 def make_reach(
     plant: Plant, limits: LimitsParameters, parameters: GateParameters, tick_ns: int, ticks_per_horizon: int
 ) -> Reach:
-    """Make the reach of a plant whose inputs are what the last gate lets through."""
+    """Make the reach of a plant whose inputs are what the setpoint limiter lets through."""
     a, b, _ = plant.transition(tick_ns * 1e-9)
     bounds = np.array([limits.accel_mps2[AXES.index(axis)] for axis in plant.axes])
     largest = np.abs(np.linalg.pinv(plant.accel_map)) @ bounds

@@ -16,11 +16,11 @@ class Action(Enum):
     """Action that a monitor asks for."""
 
     NONE = auto()
-    DISTRUST_POSITIONS = auto()  # drop the positions captured since `since_ns`
+    DISTRUST_POSITIONS = auto()  # refuse the present position; with `since_ns`, drop those captured since then, too
     DISTRUST_INERTIAL = auto()  # use no inertial data from `since_ns` on
     DISTRUST_VEHICLE_VELOCITY = auto()  # neither brake on the vehicle's own velocity nor compare with it
     BRAKE = auto()  # fly no plan until the cause is gone
-    END_PLANS = auto()  # never fly a plan again in this flight
+    END_PLANS = auto()  # fly no plan again in this flight: the fallback ends it
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -29,7 +29,7 @@ class Verdict(msgspec.Struct, frozen=True):
     action: Action = Action.NONE
     cause: EventCode | None = None  # None without an action
     text: str = ""  # cause in words
-    since_ns: int | None = None  # time from which on data are distrusted [ns]; None where nothing is
+    since_ns: int | None = None  # earlier data from this time on are distrusted, too [ns]; None for no earlier data
 
     @property
     def is_none(self) -> bool:

@@ -3,7 +3,7 @@
 1. A disturbance is a transform of standard normal draws, which are the same for every cell.
 2. A `CellSetting` holds what is the same for every controller: plant, limits, costs, start, link and disturbance.
 3. A `Recipe` is made once for each belief; each worker builds its own controller from it.
-4. A `BaselineSolver` replaces the SMPC within the flight core; filter, fallback and last gate stay.
+4. A `BaselineSolver` replaces the SMPC within the flight core; filter, fallback and setpoint limiter stay.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The margin of a row is b - c'x: what its limit leaves. The back-off β is the margin that a row must keep.
 
-1. `allocate_by_price` and `allocate_equally` give each age t a budget ε̄_t of the allowed risk 1 - δ_x, with
+1. `allocate_by_age` and `allocate_equally` give each age t a budget ε̄_t of the allowed risk 1 - δ_x, with
    Σ_t π_t ε̄_t = 1 - δ_x - P(a > H).
 2. `reallocate_to_rows` gives the budget of an age to the rows of a plan (iterative risk allocation): rows that do not
    bind give risk to rows that bind. Row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti.
@@ -38,7 +38,7 @@ from uavctl.smpc.nominal import ControlProblem, Part, propagate_covariance
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import find_pairs
 
-PRICE = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
+AGE_EXPONENT = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
 MAX_RISK = 0.5  # largest risk of a row: with more, the mean would be outside of its limit
 MIN_RISK = 1e-9  # least remainder of the allowed risk, as a share of it: a smaller one is rounding
 RARE_SHARE = 0.05  # share of the allowed risk that the oldest ages, without back-offs, may use in transit
@@ -59,8 +59,8 @@ class AgeRisk:
         return np.where(self.budgets >= 1.0, np.inf, self.budgets)
 
 
-def allocate_by_price(
-    link: AgeModel, deviations: Array, allowed: float, price: float = PRICE, corner: int = 1
+def allocate_by_age(
+    link: AgeModel, deviations: Array, allowed: float, exponent: float = AGE_EXPONENT, n_binding: int = 1
 ) -> AgeRisk:
     """Allocate the allowed risk so that Σ_t π_t^h β_t is least where n equal rows bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.
 
@@ -70,23 +70,23 @@ def allocate_by_price(
     Args:
         deviations: σ_t (H,) of the rows.
         allowed: 1 - δ_x.
-        price: h.
-        corner: n, the number of rows that may bind together.
+        exponent: h.
+        n_binding: n, the number of rows that may bind together.
 
     Raises:
         DesignError: Information is older than the horizon more often than allowed.
     """
     steps = len(deviations)
     weights, older_probability, remaining = _weigh_ages(link, steps, allowed)
-    max_budget = min(1.0, corner * MAX_RISK)
+    max_budget = min(1.0, n_binding * MAX_RISK)
     if not deviations.all():
         return AgeRisk(weights, older_probability, np.full(steps, min(remaining / weights.sum(), max_budget)))
     # Stationary: π_t φ(κ_t) / σ_t = λ π_t^h, so κ_t² = 2 log(π_t^(1-h) / (λ σ_t)) where that is positive.
-    scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - price) - np.log(deviations)
+    scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - exponent) - np.log(deviations)
 
     def budgets(level: float) -> Array:
         # ε̄_t = n Φ(-κ_t), not larger for a younger age: a link better than its model uses no more risk.
-        values = np.minimum(corner * ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))), max_budget)
+        values = np.minimum(n_binding * ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))), max_budget)
         return np.ascontiguousarray(np.minimum.accumulate(values[::-1])[::-1])
 
     def excess(level: float) -> float:
@@ -98,7 +98,7 @@ def allocate_by_price(
     return AgeRisk(weights, older_probability, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))
 
 
-def allocate_equally(link: AgeModel, steps: int, allowed: float, corner: int = 1) -> AgeRisk:
+def allocate_equally(link: AgeModel, steps: int, allowed: float, n_binding: int = 1) -> AgeRisk:
     """Allocate the allowed risk equally to the ages, except the oldest and rarest: those have no back-offs.
 
     Where a target is far from all limits, no plan comes to rest near one. Limits matter in transit only, for plans of
@@ -115,7 +115,7 @@ def allocate_equally(link: AgeModel, steps: int, allowed: float, corner: int = 1
     weights, older_probability, remaining = _weigh_ages(link, steps, allowed)
     older = np.cumsum(weights[::-1])[::-1]
     rare = older <= RARE_SHARE * remaining
-    max_budget = min(1.0, corner * MAX_RISK)
+    max_budget = min(1.0, n_binding * MAX_RISK)
     equal = min(max_budget, (remaining - float(weights[rare].sum())) / float(weights[~rare].sum()))
     return AgeRisk(weights, older_probability, np.where(rare, 1.0, equal))
 
@@ -327,29 +327,29 @@ class _RestingRows:
     reach: Array  # g_s, distance from the limit that inputs can gain (H, m)
     jump: Array  # deviations of c'A^s e (L, H, m), the effect of a new position on the rows
 
-    def find_distance(self, row: int, share: int, allowed: float) -> float:
-        """Return the distance to keep from a row that shares the risk with `share` - 1 others."""
+    def find_distance(self, row: int, n_rows: int, allowed: float) -> float:
+        """Return the distance to keep from a row that shares the risk with `n_rows` - 1 others."""
         weights, sigma = self.risk.age_probabilities[self.age :], self.sigma[: self.gaps.size, row]
         ages = np.minimum(self.age + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
-        backoff = quantile(self.risk.shares[ages] / share) * self.sigma[:, row]
+        backoff = quantile(self.risk.shares[ages] / n_rows) * self.sigma[:, row]
         before, jumps = backoff[: self.gaps.size, None], self.jump[:, :, row]
 
-        def rest_excess(d: float) -> float:
+        def outside_excess(d: float) -> float:
             # Σ_t π_t Φ(-d / σ_t) - (1 - δ_x - P(a > H)) / n
             return (
                 float(weights @ violation_risk(np.full_like(sigma, d), sigma))
-                - (allowed - self.risk.older_probability) / share
+                - (allowed - self.risk.older_probability) / n_rows
             )
 
         def slack_excess(d: float) -> float:
             # Σ_t q_t max_s Φ(-(max(d, β_t) - β_s + g_s) / σ_ts) - 0.7 (1 - δ_x) / n
             margin = np.maximum(d, before) - backoff + self.reach[:, row]
-            return float(self.gaps @ violation_risk(margin, jumps).max(axis=1)) - SLACK_SHARE * allowed / share
+            return float(self.gaps @ violation_risk(margin, jumps).max(axis=1)) - SLACK_SHARE * allowed / n_rows
 
         from scipy.optimize import brentq  # slow to import, needed for a design only
 
         distance = 0.0
-        for excess in (rest_excess, slack_excess):
+        for excess in (outside_excess, slack_excess):
             if excess(distance) > 0.0:
                 upper = distance + float(max(self.sigma[:, row].max(), backoff.max(), jumps.max()))
                 while excess(upper) > 0.0:

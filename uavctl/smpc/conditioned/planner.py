@@ -33,13 +33,13 @@ from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite
 from uavctl.smpc.batch import Decisions, gather_answers
 from uavctl.smpc.conditioned.backoffs import (
+    AGE_EXPONENT,
     DISTANT_SHARE,
     MAX_RISK,
-    PRICE,
     AgeRisk,
     Deviations,
     Flags,
-    allocate_by_price,
+    allocate_by_age,
     allocate_equally,
     compute_reference_backoffs,
     find_binding,
@@ -121,7 +121,7 @@ class ConditionedSolver:
         problem: ControlProblem,
         link: AgeModel,
         allowed: float,
-        price: float = PRICE,
+        exponent: float = AGE_EXPONENT,
         slew_mps3: float = math.inf,
         cov: Array | None = None,
         filter_plant: Plant | None = None,
@@ -158,7 +158,7 @@ class ConditionedSolver:
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.broadcast_to(np.zeros(problem.input_set.b.size), (steps, problem.input_set.b.size))
         self._no_backoff.setflags(write=False)
-        # Rooms of all rows minus their back-offs, and the view of the state rows (H, m)
+        # Margins of all rows minus their back-offs, and the view of the state rows (H, m)
         self._margins = np.full(width * steps + hard + 1, OPEN)
         self._margins_x = self._margins[: width * steps].reshape(steps, width)
         self._used_margin = np.zeros((steps, width))  # margin of state rows that all parts use so far
@@ -179,7 +179,7 @@ class ConditionedSolver:
                 reference_backoffs,
             )
 
-        self._near = make_allocation(allocate_by_price(link, self._find_pacing_deviations(), allowed, price, n_parts))
+        self._near = make_allocation(allocate_by_age(link, self._find_pacing_deviations(), allowed, exponent, n_parts))
         self._transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
@@ -299,7 +299,7 @@ class ConditionedSolver:
         return self._transit if np.count_nonzero(placed <= kept) == kept.size else self._near
 
     def _find_row_backoffs(self, allocation: _Allocation, preview: Preview) -> _RowBackoffs:
-        """Return the margins of a preview; the last ones are cached, by the bits of their arguments."""
+        """Return the back-offs for a preview; the last ones are cached, by the bits of their arguments."""
         key = allocation is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             sigma, age = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
@@ -342,7 +342,7 @@ class ConditionedSolver:
 
         Args:
             margin: Margin of the state rows for z = 0 (H, m).
-            hard: Room of the hard rows for z = 0.
+            hard: Margin of the hard rows for z = 0.
         """
         backoff, sigma, budgets = row_backoffs.backoff, row_backoffs.sigma, row_backoffs.budgets
         violated_x, violated = margin < backoff, hard < 0.0

@@ -1,8 +1,8 @@
 """The QP of an independent part: slew limits, rows, regulated plans, reference equilibria.
 
-1. `SlewRows`: the last gate lets a setpoint move by slew · tick in each tick, and inputs are held for a step. A change
-   of up to slew · Δt has arrived with the last tick of its step: rows bound the change from step to step by that. While
-   it moves, the setpoint lags the plan by half a step on average.
+1. `SlewRows`: the setpoint limiter lets a setpoint move by slew · tick in each tick, and inputs are held for a step. A
+   change of up to slew · Δt has arrived with the last tick of its step: rows bound the change from step to step by
+   that. While it moves, the setpoint lags the plan by half a step on average.
 2. `RegulatedRows`: plan of the regulator for the whole plant, and the margin that it leaves in all rows: one product
    each. State rows stand side by side, part after part. Hard rows are in inputs alone and come part after part, each
    with its stages in order: rows of the input set, then both sides of its slew rows.
@@ -90,7 +90,7 @@ MAX_ITERATIONS = 2000  # of one program
 class PartProgram:
     """min |z|² with all rows kept; state rows are soft; one row for both sides of a direction.
 
-    Rooms are one vector of the whole plant: state rows, stage after stage, then the hard rows part after part (see
+    Margins are one vector of the whole plant: state rows, stage after stage, then the hard rows part after part (see
     `RegulatedRows`), and OPEN at the end for a side without a limit.
 
     Attributes:
@@ -350,7 +350,7 @@ class RegulatedRows:
             dx: Deviation of the state (n_x,).
             sides: Right sides of the state rows minus their values at the reference, (H, m) or (m,).
             hold: Input at the reference (n_u,); None for zero.
-            first: See `SlewRows.first`; None if the input sent last is unknown.
+            first: See `SlewRows.measure_first_step`; None if the input sent last is unknown.
             tightening: Reduction of the right sides of the input set (m,); None: none.
         """
         # b - C x_t(dx), b - C u_t(dx), side ∓ D (u_t - u_(t-1))
