@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
+from uavctl.constraint_names import ConstraintNames, name_constraints
 from uavctl.errors import RecordingError
-from uavctl.records import Header, Matrix, Names, Vec3, Vector, names_of
+from uavctl.records import Header, Matrix, Vec3, Vector
 
 AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}
 
@@ -61,9 +62,9 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
             raise ValueError(f"shapes do not fit each other: {', '.join(wrong)}")
 
     @cached_property
-    def names(self) -> Names:
+    def names(self) -> ConstraintNames:
         """Return the names of states and limits."""
-        return names_of(self.c_x, len(self.target), self.axes, self.position_index, self.velocity_index)
+        return name_constraints(self.c_x, len(self.target), self.axes, self.position_index, self.velocity_index)
 
     @property
     def dt_ns(self) -> int:

@@ -27,6 +27,7 @@ from logs.recording.topics import (
     parse_raw_topic,
     round_plan,
 )
+from uavctl.constraint_names import name_constraints
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,
@@ -39,8 +40,7 @@ from uavctl.records import (
     Refused,
     Sink,
     StepInput,
-    names_of,
-    to_nobody,
+    discard,
 )
 from uavctl.smpc.plant import AXES, Plant
 
@@ -143,7 +143,7 @@ class FieldNames:
     """
 
     def __init__(self, plant: Plant) -> None:
-        self._states = names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index).states
+        self._states = name_constraints((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index).states
         self._inputs = tuple(
             (f"{axis} input", "m/s²" if accel == 1.0 else "")
             for axis, accel in zip(plant.axes, plant.accel_per_input, strict=True)
@@ -481,7 +481,7 @@ def replay(
             for command in record.commands:
                 loop.order(command)
             loop.answered(record.answered_ns)
-            loop.tick(record.tick, record.at_ns, to_nobody, record.missed_ticks, record.stop)
+            loop.tick(record.tick, record.at_ns, discard, record.missed_ticks, record.stop)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):

@@ -21,7 +21,8 @@ from uavctl.account import make_ending, report_lost_records
 from uavctl.arrays import Array
 from uavctl.cause import CAUSES, Cause
 from uavctl.config.mission import FenceConfig
-from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector, duration, number, percent_above
+from uavctl.number_text import format_duration, format_number, format_percent_above
+from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector
 
 # How a recorded flight ended: the daemon's own last word, or what its records tell where there is none.
 
@@ -83,7 +84,7 @@ def _describe_hand_over(flight: FlightData) -> str:
 
 
 def _format_seconds(flight: FlightData, at_ns: int) -> str:
-    return f"{number(float(flight.seconds([at_ns])[0]))} s"
+    return f"{format_number(float(flight.seconds([at_ns])[0]))} s"
 
 
 # The limits of the state over a flight: constant ones, and fences that closed in.
@@ -278,8 +279,10 @@ def describe_prediction(summary: FlightSummary) -> str:
     s = summary
     if s.state_source == "truth" or s.final_age_s is None or s.final_age_s <= max(BLIND_S, BLIND_STEPS * s.dt_s):
         return ""
-    std_text = "" if s.final_std_m is None else f", standard deviation {number(s.final_std_m)} m by its own account"
-    return f"predicted only: the newest position was {number(s.final_age_s)} s old{std_text}"
+    std_text = (
+        "" if s.final_std_m is None else f", standard deviation {format_number(s.final_std_m)} m by its own account"
+    )
+    return f"predicted only: the newest position was {format_number(s.final_age_s)} s old{std_text}"
 
 
 def _count_channel_positions(flight: FlightData) -> tuple[int, int | None]:
@@ -295,7 +298,9 @@ def _describe_methods(s: FlightSummary) -> str:
     """Return the number of plans by method, and the largest certified gap to the optimum."""
     if not s.methods:
         return "none"
-    certified = "" if s.largest_gap is None else f"; certified gap at most {percent_above(s.largest_gap)} of the cost"
+    certified = (
+        "" if s.largest_gap is None else f"; certified gap at most {format_percent_above(s.largest_gap)} of the cost"
+    )
     return ", ".join(f"{n} {method}" for method, n in s.methods.items()) + certified
 
 
@@ -404,12 +409,12 @@ def list_summary_rows(summary: FlightSummary) -> list[tuple[str, str]]:
     lost_text = "" if s.lost is None else f", {s.lost} lost{_format_share(s.lost, s.received + s.lost)}"
     source_text = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
     summary_rows = [
-        ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_describe_pace(s)}"),
+        ("Flown", f"{count(s.steps, 'step')}; {format_number(s.duration_s)} s{_describe_pace(s)}"),
         ("Ended", f"{s.ending.sentence} The recording breaks off." if s.breaks_off else s.ending.sentence),
         *((("Relay", s.ending.relay),) if s.ending.relay else ()),
         *(() if s.let_go is None else (("Let go", s.let_go),)),
         ("Positions", f"{s.received} received{lost_text}; {s.accepted} used, {s.rejected} refused"),
-        ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
+        ("Largest age", f"{count(s.max_age, 'step')} ({format_number(s.max_age_s)} s)"),
         ("Fallbacks", str(s.fallbacks)),
         (
             "State outside limits",
@@ -435,8 +440,8 @@ def list_summary_rows(summary: FlightSummary) -> list[tuple[str, str]]:
 def _describe_pace(s: FlightSummary) -> str:
     if s.wall_s is None or not _is_virtual_time(s):
         return ""
-    factor_text = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
-    return f" in {number(s.wall_s)} s{factor_text}"
+    factor_text = "" if s.real_time_factor is None else f" ({format_number(s.real_time_factor, 1)} × real time)"
+    return f" in {format_number(s.wall_s)} s{factor_text}"
 
 
 def _describe_lateness(s: FlightSummary) -> tuple[str, str]:
@@ -457,12 +462,12 @@ def _describe_distance(s: FlightSummary) -> str:
     if s.final_error_m is None:
         return "not flown"
     prediction = describe_prediction(s)
-    final_text = f"{number(s.final_error_m)} m at the last flown step{f' ({prediction})' if prediction else ''}"
+    final_text = f"{format_number(s.final_error_m)} m at the last flown step{f' ({prediction})' if prediction else ''}"
     if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
         return f"{final_text}; it never came within {ARRIVED_M:g} m"
     period = "on the whole way" if s.trajectory else "from each arrival on"
-    max_text = f"at most {number(s.course_worst_m)} m, at {number(s.course_worst_s)} s"
-    return f"{number(s.course_rms_m)} m {period} (rms), {max_text}; {final_text}"
+    max_text = f"at most {format_number(s.course_worst_m)} m, at {format_number(s.course_worst_s)} s"
+    return f"{format_number(s.course_rms_m)} m {period} (rms), {max_text}; {final_text}"
 
 
 def _format_share(part: int, whole: int) -> str:
@@ -472,7 +477,9 @@ def _format_share(part: int, whole: int) -> str:
 def _format_percentiles(times: Percentiles) -> str:
     if times.p50 is None or times.p99 is None or times.max is None:
         return "not measured"
-    return f"median {duration(times.p50)}, 99 % {duration(times.p99)}, largest {duration(times.max)}"
+    return (
+        f"median {format_duration(times.p50)}, 99 % {format_duration(times.p99)}, largest {format_duration(times.max)}"
+    )
 
 
 def count(amount: int, noun: str) -> str:

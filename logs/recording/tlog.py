@@ -24,7 +24,7 @@ from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
 from uavctl.mavlink.framing import is_frame
-from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, to_nobody
+from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, discard
 
 # The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
 
@@ -509,18 +509,18 @@ def replay_tlog(
     for at_ns, data in packets:
         start_ns = at_ns if start_ns is None else start_ns
         while start_ns + tick * tick_ns < at_ns:
-            loop.tick(tick, start_ns + tick * tick_ns, to_nobody)
+            loop.tick(tick, start_ns + tick * tick_ns, discard)
             tick += 1
         loop.receive(link, data, at_ns)
         datagrams += 1
     if start_ns is None:
         return _summarise_delays(collector, link, datagrams, tick)
     end_ns = start_ns + tick * tick_ns
-    loop.tick(tick, end_ns, to_nobody)  # sees the last packets
+    loop.tick(tick, end_ns, discard)  # sees the last packets
     tick += 1
     collector.over, later = True, tick
     while collector.stats[link].at_ns < end_ns:  # they are told once a second
-        loop.tick(later, start_ns + later * tick_ns, to_nobody)
+        loop.tick(later, start_ns + later * tick_ns, discard)
         later += 1
     return _summarise_delays(collector, link, datagrams, tick)
 

@@ -33,7 +33,7 @@ from logs.report.svg import (
     open_canvas,
 )
 from uavctl.arrays import Array
-from uavctl.records import duration
+from uavctl.number_text import format_duration
 
 WIDE_IN = 8.6
 MAX_MARKS = 1500
@@ -187,9 +187,11 @@ def _draw_times(flight: FlightData, key: str, title: str, t_s: Array, values_us:
             )
         ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
         ax.yaxis.set_minor_locator(NullLocator())
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: duration(value)))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: format_duration(value)))
         set_time_axis(ax, flight)
-    return Drawing(key, canvas.svg, f"{title} over time; median {duration(p50)}, 99 percent below {duration(p99)}")
+    return Drawing(
+        key, canvas.svg, f"{title} over time; median {format_duration(p50)}, 99 percent below {format_duration(p99)}"
+    )
 
 
 def thin_keeping_largest(t_s: Array, values: Array) -> tuple[Array, Array]:

@@ -27,7 +27,8 @@ from logs.report.verdict_sections import make_clocks_section, make_model_section
 from logs.report.verdicts import Judgement, judge_flight
 from uavctl.errors import UavctlError
 from uavctl.event_codes import EventCode
-from uavctl.records import Event, number
+from uavctl.number_text import format_number
+from uavctl.records import Event
 
 _LIMIT = Mark("dashed", "limit", "limit")
 _TARGET = Mark("dotted", "target", "target")
@@ -172,8 +173,8 @@ def _describe_quickest(delay: DelayVerdict) -> str:
     """Return a sentence on delays where the sender's clock is known by the quickest arrival only."""
     if delay.latency_ms:
         return (
-            f" The shortest delay is taken to be {number(delay.latency_ms)} ms (clock.latency_s), as the sender's "
-            "clock is only known by it."
+            f" The shortest delay is taken to be {format_number(delay.latency_ms)} ms (clock.latency_s), as the "
+            "sender's clock is only known by it."
         )
     return " Delays are short of the quickest one, as the sender's clock is only known by it."
 

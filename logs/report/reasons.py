@@ -10,7 +10,7 @@ from logs.recording.summary import count
 from logs.report.evidence import FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion, select_trusted_estimates
 from logs.report.findings import metres, seconds
-from uavctl.records import number
+from uavctl.number_text import format_number
 
 _MIN_ESTIMATE_ERROR_M = 0.3  # between the estimate and the true place: worth telling
 _GATE_SHARE = 0.15  # of the setpoints: setting out takes some
@@ -83,7 +83,7 @@ def _describe_bias(e: FlightEvidence) -> Iterator[str]:
             lasted_s = int(is_at_bound.sum()) * e.flight.tick_ns * 1e-9
             unit = e.flight.design.input_unit
             yield (
-                f"The estimated bias was at its bound of {number(bound, 2)} {unit} towards {direction} for "
+                f"The estimated bias was at its bound of {format_number(bound, 2)} {unit} towards {direction} for "
                 f"{seconds(lasted_s)}, first at {seconds(float(t_s[is_at_bound][0]))}."
             )
 
@@ -98,7 +98,7 @@ def _describe_model(e: FlightEvidence) -> Iterator[str]:
             yield (
                 f"Positions showed {max_mps2:.1f} m/s² that no setpoint had asked for, at "
                 f"{seconds(e.to_seconds(at_ns))}; "
-                f"{number(bound)} m/s² is what wind and the model's error may make."
+                f"{format_number(bound)} m/s² is what wind and the model's error may make."
             )
     model = e.judged.verdicts.model
     axes = () if model is None else model.axes

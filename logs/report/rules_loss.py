@@ -17,7 +17,8 @@ from uavctl.cause import Cause
 from uavctl.event_codes import EventCode
 from uavctl.flight.supervise import POSITION_CODES
 from uavctl.mavlink.connection import DISCONNECT_TEXTS, VEHICLE
-from uavctl.records import ControlMode, number
+from uavctl.number_text import format_number
+from uavctl.records import ControlMode
 
 HEARTBEAT_TIMEOUT_S = 2.5  # a heartbeat comes each second
 WRONG_POSITION_M = 0.3  # between a position that was used and the true place: no noise of a camera
@@ -151,7 +152,7 @@ def find_blind_flight(e: FlightEvidence) -> Iterator[Finding]:
     end_text = f"to {seconds(ended_s)}" if e.has_position_after(ended_s) else "on to the last step flown"
     text = (
         f"no position came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} {end_text}, and plans reach "
-        f"{number(reach_s, 1)} s"
+        f"{format_number(reach_s, 1)} s"
     )
     drift_m = e.compute_max_drift_m(begun_s, ended_s)
     if drift_m is not None and drift_m >= GRAVE_M:

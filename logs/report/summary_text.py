@@ -9,7 +9,8 @@ import numpy as np
 from logs.recording.flight import FLOWN, FlightData
 from logs.recording.notes import NoteKind
 from logs.recording.summary import FlightSummary
-from uavctl.records import number, severity, tell, worst
+from uavctl.constraint_names import compute_severity, describe_relaxed, find_worst
+from uavctl.number_text import format_number
 
 # A target that moves by less than this share of its longest step only settles.
 _SETTLING_SHARE = 0.05
@@ -36,7 +37,7 @@ def describe_part_begin(flight: FlightData) -> str:
     if not flight.part:
         return ""
     into_s = first.tick * flight.tick_ns * 1e-9
-    return f"tick {first.tick}" + (f", {number(into_s)} s into the flight" if into_s else "")
+    return f"tick {first.tick}" + (f", {format_number(into_s)} s into the flight" if into_s else "")
 
 
 def _describe_part(flight: FlightData) -> list[str]:
@@ -48,7 +49,7 @@ def _describe_part(flight: FlightData) -> list[str]:
 def _describe_engagement(flight: FlightData) -> list[str]:
     """Return a sentence on when the controller took over; none if it flew from the first tick on."""
     begun_s = flight.spans(FLOWN)[0][0]
-    return [f"The controller took over {number(begun_s)} s after the first tick."] if begun_s else []
+    return [f"The controller took over {format_number(begun_s)} s after the first tick."] if begun_s else []
 
 
 def _describe_cut(flight: FlightData) -> list[str]:
@@ -79,8 +80,8 @@ def _describe_fallback(flight: FlightData, s: FlightSummary) -> list[str]:
     course = f"({', '.join(dict.fromkeys(modes))}) " if len(set(modes)) > 1 else ""
     times = "once" if s.fallbacks == 1 else f"{s.fallbacks} times"
     return [
-        f"The fallback {course}took over {times}, for {number(total_s)} s in all; "
-        f"{'' if s.fallbacks == 1 else 'first '}at {number(spans[0][0])} s: {first.reason}."
+        f"The fallback {course}took over {times}, for {format_number(total_s)} s in all; "
+        f"{'' if s.fallbacks == 1 else 'first '}at {format_number(spans[0][0])} s: {first.reason}."
     ]
 
 
@@ -90,9 +91,10 @@ def _describe_relaxed_plan(flight: FlightData) -> list[str]:
     plans = [plan for plan in flight.flown_plans.values() if plan.gave_way]
     if not plans:
         return []
-    plan = max(plans, key=lambda plan: severity(names, worst(names, plan.gave_way)))
+    plan = max(plans, key=lambda plan: compute_severity(names, find_worst(names, plan.gave_way)))
     at_s = float(flight.seconds([plan.base_ns])[0])
-    return [f"At worst, in the plan of {number(at_s)} s, the {tell(names, worst(names, plan.gave_way))}."]
+    worst = describe_relaxed(names, find_worst(names, plan.gave_way))
+    return [f"At worst, in the plan of {format_number(at_s)} s, the {worst}."]
 
 
 def _describe_waypoints(flight: FlightData) -> list[str]:
@@ -124,9 +126,11 @@ def _describe_trajectory(flight: FlightData) -> list[str]:
     if not len(moving_indices):
         return ["The trajectory did not move."]
     begun_s, ended_s = float(times_s[moving_indices[0]]), float(times_s[moving_indices[-1] + 1])
-    length_m = number(float(step_lengths_m.sum()))
-    return [f"It was to follow a trajectory, {length_m} m from {number(begun_s)} s to {number(ended_s)} s."]
+    length_m = format_number(float(step_lengths_m.sum()))
+    return [
+        f"It was to follow a trajectory, {length_m} m from {format_number(begun_s)} s to {format_number(ended_s)} s."
+    ]
 
 
 def _format_seconds(flight: FlightData, at_ns: int) -> str:
-    return f"{number(float(flight.seconds([at_ns])[0]))} s"
+    return f"{format_number(float(flight.seconds([at_ns])[0]))} s"

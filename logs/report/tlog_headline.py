@@ -19,7 +19,7 @@ from logs.report.vehicle_texts import FAILSAFE_MODES, classify_text
 from uavctl.arrays import Array
 from uavctl.cause import BAD, Cause
 from uavctl.mavlink.profile import PROFILES
-from uavctl.records import number
+from uavctl.number_text import format_number
 
 _ERROR_SEVERITIES = ("emergency", "alert", "critical", "error")  # of MAV_SEVERITY
 _WARNING_SEVERITIES = (*_ERROR_SEVERITIES, "warning")
@@ -99,7 +99,7 @@ def _make_clear_finding(armed: ArmedFlight) -> Finding:
     flight = armed.flight
     texts = [f"armed for {seconds(sum(end - begin for begin, end in armed.spans))}"]
     if flight.sent:
-        texts.append(f"no position was missing for longer than {number(_measure_silence(armed)[0], 2)} s")
+        texts.append(f"no position was missing for longer than {format_number(_measure_silence(armed)[0], 2)} s")
         apart_m, apart_s, _ = _measure_disagreement(armed)
         if np.isfinite(apart_s):
             texts.append(f"its own kept within {metres(apart_m)} of them")

@@ -11,7 +11,8 @@ from logs.recording.design_view import AXIS_NUMBER
 from logs.recording.flight import FlightData
 from logs.report.statistics import two_sided_quantile
 from uavctl.arrays import Array
-from uavctl.records import LinkStats, PositionSample, Truth, duration
+from uavctl.number_text import format_duration
+from uavctl.records import LinkStats, PositionSample, Truth
 
 _MIN_OFFSETS = 3
 
@@ -117,7 +118,7 @@ def _describe_clock(verdict: ClockVerdict) -> str:
     refused_text = f"; {verdict.rejected} answers were refused" if verdict.rejected else ""
     return (
         f"{text}; it drifted by {format_plain(verdict.drift_ppm)} ppm and moved by "
-        f"{duration(verdict.residual_us)} about that (root mean square){round_trip_text}{refused_text}."
+        f"{format_duration(verdict.residual_us)} about that (root mean square){round_trip_text}{refused_text}."
     )
 
 

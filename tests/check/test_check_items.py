@@ -19,7 +19,7 @@ from uavctl.config import load_config
 from uavctl.config.connections import CheckConfig
 from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
-from uavctl.records import Outgoing, to_nobody
+from uavctl.records import Outgoing, discard
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
@@ -316,7 +316,7 @@ def told_by_motive(*place: float) -> Preflight:
     )
     for n in range(60):
         flight.receive("mocap", peer.send("odometry", 10**9 + 50_000 * n, *level), n * 50 * MS)
-        flight.tick(n, n * 50 * MS, to_nobody)
+        flight.tick(n, n * 50 * MS, discard)
     return flight
 
 
@@ -387,5 +387,5 @@ def test_random_bytes_never_raise(chunks: list[bytes]) -> None:
     flight = Preflight(load_config("room-hahn-stursberg"), make_links, 0)
     for n, data in enumerate(chunks):
         flight.receive("vehicle" if n % 2 else "mocap", data, n * MS)
-        flight.tick(n, n * MS, to_nobody)
+        flight.tick(n, n * MS, discard)
     assert flight.make_items(S)

@@ -14,6 +14,7 @@ from uavctl.build.controller import build_controller, build_design
 from uavctl.build.mission import build_mission, build_reference_limits, build_trajectory
 from uavctl.config import load_config
 from uavctl.config.types import Config
+from uavctl.constraint_names import describe_all_relaxed, describe_relaxed, name_constraints
 from uavctl.errors import ConfigError, DesignError
 from uavctl.flight.mission import (
     Fence,
@@ -30,7 +31,7 @@ from uavctl.flight.mission import (
     resume,
     stay_at,
 )
-from uavctl.records import GaveWay, Vec3, names_of, tell, tell_all
+from uavctl.records import GaveWay, Vec3
 from uavctl.smpc.hahn_stursberg.design import Design
 
 Array = NDArray[np.float64]
@@ -338,16 +339,16 @@ def test_a_fence_that_the_design_cannot_take_is_refused(fence: str, key: str, wo
 
 
 def test_what_gave_way_is_told_in_words() -> None:
-    names = names_of([[2.0, 0.0], [0.0, -1.0], [1.0, 1.0]], 2, ("north",), (0,), (1,))
+    names = name_constraints([[2.0, 0.0], [0.0, -1.0], [1.0, 1.0]], 2, ("north",), (0,), (1,))
     upper = GaveWay(constraint="state", stage=3, index=0, amount=0.24)
     speed = GaveWay(constraint="terminal", stage=8, index=1, amount=0.05)
     mixed = GaveWay(constraint="state", stage=1, index=2, amount=0.01)
     rest = GaveWay(constraint="equilibrium", stage=8, index=1, amount=0.5)
-    assert tell(names, upper) == "upper limit of north position gave way by 0.12 m in stage 3"
-    assert tell(names, speed) == (
+    assert describe_relaxed(names, upper) == "upper limit of north position gave way by 0.12 m in stage 3"
+    assert describe_relaxed(names, speed) == (
         "lower limit of north velocity gave way by 0.05 m/s where the plan rests, from stage 8 on"
     )
-    assert tell(names, mixed) == "row 2 of the state limits gave way by 0.01 in stage 1"
-    assert tell(names, rest) == "rest was missed by 0.5 m/s of north velocity in stage 8"
-    assert tell_all(names, (upper,)) == tell(names, upper)
-    assert tell_all(names, (speed, upper, rest)) == tell(names, upper) + "; so did 2 others"
+    assert describe_relaxed(names, mixed) == "row 2 of the state limits gave way by 0.01 in stage 1"
+    assert describe_relaxed(names, rest) == "rest was missed by 0.5 m/s of north velocity in stage 8"
+    assert describe_all_relaxed(names, (upper,)) == describe_relaxed(names, upper)
+    assert describe_all_relaxed(names, (speed, upper, rest)) == describe_relaxed(names, upper) + "; so did 2 others"

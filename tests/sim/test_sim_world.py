@@ -12,7 +12,7 @@ from sim_rig import Client, decode
 from sim.simulation import MOCAP, VEHICLE, Peers, World
 from uavctl.arrays import SECOND_NS
 from uavctl.config import load_config
-from uavctl.records import Outgoing, Received, Send, Truth, Vec3, to_nobody
+from uavctl.records import Outgoing, Received, Send, Truth, Vec3, discard
 
 MS = 1_000_000
 
@@ -143,7 +143,7 @@ def test_blackout_and_corruption_reach_the_flyer_as_such() -> None:
 def test_answers_come_back_on_the_wire_and_the_cameras_listen_to_nothing() -> None:
     class Asking(Scripted):
         def tick(self, tick: int, at_ns: int, send: Send) -> None:
-            super().tick(tick, at_ns, to_nobody)
+            super().tick(tick, at_ns, discard)
             for link in (VEHICLE, MOCAP):
                 send(Outgoing(link=link, data=self.client.timesync(at_ns + 1)))
 

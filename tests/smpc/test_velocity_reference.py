@@ -19,8 +19,8 @@ from uavctl.arrays import SECOND_NS, Array
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
+from uavctl.constraint_names import name_constraints
 from uavctl.errors import ConfigError, DesignError
-from uavctl.records import names_of
 from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import STATES_PER_AXIS, Plant, VelocityReferenceAxis, count_reach_steps, velocity_reference
 
@@ -177,7 +177,7 @@ def test_a_filter_of_positions_keeps_correcting_the_reference() -> None:
 
 def test_states_have_names() -> None:
     plant = held()
-    names = names_of([], plant.n_x, plant.axes, plant.position_index, plant.velocity_index, plant.extra_states)
+    names = name_constraints([], plant.n_x, plant.axes, plant.position_index, plant.velocity_index, plant.extra_states)
     assert names.states == (
         ("north position", "m"),
         ("north velocity", "m/s"),

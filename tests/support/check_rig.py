@@ -15,7 +15,7 @@ from uavctl.check.findings import Item, ItemState
 from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.loop import make_links
-from uavctl.records import to_nobody
+from uavctl.records import discard
 
 TICK_NS, S = 50_000_000, 1_000_000_000
 # Cameras as they are: the sim's own [frame] is right, the one of the check is what is tried.
@@ -120,7 +120,7 @@ class HandMotion:
             observed = [sum(a * b for a, b in zip(row, self.place, strict=True)) for row in self.matrix]
             x, y, z = (value + self._random.gauss(0.0, 0.003) for value in observed)
             self.flight.receive("mocap", self.cameras.vision(self.at_ns // 1000 + 10**9, x, y, z), self.at_ns)
-            self.flight.tick(0, self.at_ns, to_nobody)
+            self.flight.tick(0, self.at_ns, discard)
 
     def carry(self, *displacement_m: float) -> None:
         """Carry it along a way in 1 s, and hold it for 1.5 s."""

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 
 from uavctl.arrays import Array
+from uavctl.constraint_names import name_constraints
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
@@ -21,7 +22,7 @@ from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.flight.state import ControlState
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
-from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus, names_of
+from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.plant import Plant
 
@@ -138,7 +139,7 @@ def make_controller(
         mission=make_hold_mission(
             np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=make_room(plant)
         ),
-        names=names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
+        names=name_constraints((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
         estimator=estimator_parameters(**changes),
         fallback=fallback,
         limits=LimitsParameters(accel_mps2=(2.0, 2.0, 1.5), slew_mps3=100.0),

@@ -20,7 +20,7 @@ from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.check.preflight import Preflight
 from uavctl.config import Config, load_config
 from uavctl.loop import VEHICLE, ControlLoop, make_links
-from uavctl.records import Command, Event, VehicleStatus, to_nobody
+from uavctl.records import Command, Event, VehicleStatus, discard
 
 FLIGHTS = DATA / "flights"
 TICK_NS, SECOND = 50_000_000, 1_000_000_000
@@ -81,7 +81,7 @@ def run_check(name: str, since_s: float, seconds: float, *overrides: str) -> dic
     tick = 0
     for datagram in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
         while begin_ns + tick * TICK_NS <= datagram.at_ns:
-            flight.tick(tick, begin_ns + tick * TICK_NS, to_nobody)
+            flight.tick(tick, begin_ns + tick * TICK_NS, discard)
             tick += 1
         flight.receive(VEHICLE, datagram.data, datagram.at_ns)
     return {item.name: item.state.value for item in flight.make_items(begin_ns + tick * TICK_NS)}
@@ -119,7 +119,7 @@ def listen(
         while (now_ns := begin_ns + tick * TICK_NS) < datagram.at_ns:
             while waiting and waiting[0][0] <= now_ns:
                 assert loop.order(waiting.popleft()[1])
-            ticked = loop.tick(tick, now_ns, to_nobody)
+            ticked = loop.tick(tick, now_ns, discard)
             news += ticked.news
             notices += ticked.notices
             tick += 1

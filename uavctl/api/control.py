@@ -21,8 +21,8 @@ from uavctl.config import Config, dump_config, parse
 from uavctl.config import load as load_file
 from uavctl.config.load import format_overrides
 from uavctl.config.mission import MissionConfig
+from uavctl.constraint_names import name_constraints
 from uavctl.errors import ConfigError, UavctlError, UsageError, need
-from uavctl.records import names_of
 from uavctl.smpc.answer import Answer, Solver
 from uavctl.smpc.batch import BatchController, Information
 from uavctl.smpc.conditioned.planner import AnyDesign
@@ -101,7 +101,9 @@ _SUFFIXES = {"m": "_m", "m/s": "_mps", "m/s²": "_mps2"}
 def list_signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
     """Return the states and the inputs of a configuration's plant, in order."""
     model = build_plant(config)
-    states = names_of((), model.n_x, model.axes, model.position_index, model.velocity_index, model.extra_states).states
+    states = name_constraints(
+        (), model.n_x, model.axes, model.position_index, model.velocity_index, model.extra_states
+    ).states
     unit = "" if config.plant.model == "matrices" else "m/s²"
     inputs = [(f"{axis} input", unit) for axis in model.axes] or [(f"input {i}", "") for i in range(model.n_u)]
     signal_groups = (

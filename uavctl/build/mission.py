@@ -10,10 +10,10 @@ import numpy as np
 from uavctl.arrays import SECOND_NS, Array
 from uavctl.config.mission import FenceConfig, TrajectoryConfig
 from uavctl.config.types import Config
+from uavctl.constraint_names import ConstraintNames, name_constraints
 from uavctl.errors import DesignError
 from uavctl.flight.mission import Fence, Mission, Room, Trajectory, Waypoint, make_hold_mission
 from uavctl.flight.trajectory import PlantMotion, follow_positions, make_room, plan_along
-from uavctl.records import Names, names_of
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope, find_equilibria
@@ -68,10 +68,10 @@ def build_mission(config: Config, design: AnyDesign, reference_limits: Array) ->
     )
 
 
-def build_names(design: AnyDesign) -> Names:
+def build_names(design: AnyDesign) -> ConstraintNames:
     """Return the names of the design's rows and states."""
     plant = design.plant
-    return names_of(
+    return name_constraints(
         design.state_set.c.tolist(),
         plant.n_x,
         plant.axes,

@@ -35,9 +35,10 @@ from uavctl.cli.common import (
     make_table,
 )
 from uavctl.config import Config
+from uavctl.constraint_names import describe_all_relaxed
 from uavctl.errors import UsageError
 from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
-from uavctl.records import SolveStatus, tell_all
+from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign, conditioned_record
 from uavctl.smpc.hahn_stursberg.design import Design, design_record
@@ -271,7 +272,7 @@ def render_solution(answer: Answer, design: AnyDesign, config: Config, solve_us:
     if math.isfinite(answer.gap):
         bound = f"at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}"
     facts = f"cost {answer.cost:.2f} ({bound}), slack {answer.slack:.3g}, offset {answer.offset:.3g}"
-    relaxed_lines = [tell_all(build_names(design), answer.relaxed)] if answer.relaxed else []
+    relaxed_lines = [describe_all_relaxed(build_names(design), answer.relaxed)] if answer.relaxed else []
     return Group(
         head,
         facts,

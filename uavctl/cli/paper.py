@@ -42,7 +42,7 @@ from uavctl.lab.paper.claims import (
     make_depth_claims,
 )
 from uavctl.lab.paper.runs import MAX_LOCAL_RUNS, Flights, ReportProgress, Setup, fly_all
-from uavctl.records import percent_above
+from uavctl.number_text import format_percent_above
 
 _RUN_LIMITS = validators.Number(gte=1, lte=1_000_000)
 # Above this number a second design would take minutes more for the same answer.
@@ -194,7 +194,7 @@ def _describe_costs(result: VariantResult) -> str:
     spread = ", ".join(f"{std:.2f}" for std in result.settled_std)
     return (
         f"τ = {result.tau}: summed cost {result.mean_cost:.0f} ± {result.cost_stderr:.0f} (standard error), settled "
-        f"standard deviations {spread}, largest certified gap {percent_above(result.largest_gap)} of the cost"
+        f"standard deviations {spread}, largest certified gap {format_percent_above(result.largest_gap)} of the cost"
     )
 
 

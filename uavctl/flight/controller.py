@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from uavctl.arrays import Array
+from uavctl.constraint_names import ConstraintNames
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import LimitsParameters
@@ -12,7 +13,6 @@ from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.mission import Mission
 from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.outliers import GateParameters, Reach, make_reach
-from uavctl.records import Names
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.plant import Plant
 
@@ -30,7 +30,7 @@ class Controller:
     horizon: int  # H [steps]
     solver: Solver  # answers the decision problem
     mission: Mission  # waypoints or trajectory, and moving limits
-    names: Names  # names of the rows and states in events
+    names: ConstraintNames  # names of the rows and states in events
     estimator: EstimatorParameters  # parameters of the filter
     fallback: FallbackParameters  # parameters of the fallback
     limits: LimitsParameters  # parameters of the setpoint limiter

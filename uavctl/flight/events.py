@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 import msgspec
 import numpy as np
 
+from uavctl.constraint_names import describe_all_relaxed
 from uavctl.event_codes import MISSION, EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.decide import Decided
@@ -25,7 +26,7 @@ from uavctl.flight.monitors.engaged import MonitorState
 from uavctl.flight.orders import Ordered
 from uavctl.flight.state import AlarmGroup, ControlState
 from uavctl.flight.supervise import Supervised
-from uavctl.records import ControlMode, Event, LinkEstimate, Severity, Vec3, tell_all
+from uavctl.records import ControlMode, Event, LinkEstimate, Severity, Vec3
 
 FREE = 0.9  # share of its bound below which a bias no longer is at it: one that settles there is reported once
 SILENT_NS = 1_000_000_000  # without inertial data
@@ -133,7 +134,7 @@ def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -
     if decided.solve is not None and decided.trouble:
         yield _make_event(at_ns, Severity.WARNING, EventCode(f"solve-{decided.solve.value}"), decided.trouble)
     if plan is not None and plan.gave_way:
-        text = tell_all(context.controller.names, plan.gave_way)
+        text = describe_all_relaxed(context.controller.names, plan.gave_way)
         yield _make_event(at_ns, Severity.WARNING, EventCode.RELAXED, text)
     is_mission_over = _lands(decided.fallback) and not _lands(ordered.fallback)
     if mode is not context.mode or is_mission_over:

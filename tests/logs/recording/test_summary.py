@@ -16,6 +16,7 @@ from logs.recording.flight import FALLBACK, FlightData
 from logs.recording.summary import FlightSummary, Percentiles, compute_percentiles, make_summary_table, summarise
 from uavctl.errors import RecordingError
 from uavctl.event_codes import MISSION, EventCode
+from uavctl.number_text import format_number, format_percent_above
 from uavctl.records import (
     ControlMode,
     Decision,
@@ -29,8 +30,6 @@ from uavctl.records import (
     StepInput,
     Timing,
     Truth,
-    number,
-    percent_above,
 )
 
 DT_NS = 1_000_000_000
@@ -385,7 +384,7 @@ def test_the_end_is_in_the_table() -> None:
 
 @pytest.mark.parametrize(("value", "text"), [(40.0, "40"), (0.2271, "0.227"), (1234.5, "1234.5"), (360000.0, "360000")])
 def test_numbers_for_people(value: float, text: str) -> None:
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 @pytest.mark.parametrize(
@@ -403,7 +402,7 @@ def test_numbers_for_people(value: float, text: str) -> None:
     ],
 )
 def test_a_bound_in_percent_is_never_rounded_below_itself(share: float, text: str) -> None:
-    assert percent_above(share) == text
+    assert format_percent_above(share) == text
     assert 1e-2 * float(text.removesuffix(" %")) >= share * (1.0 - 1e-9)
 
 

@@ -17,7 +17,8 @@ from logs.report.summary_text import describe_flight
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
 from uavctl.event_codes import MISSION, EventCode
-from uavctl.records import ControlMode, Decision, Event, LinkStats, Order, Record, Severity, StepInput, Truth, number
+from uavctl.number_text import format_number
+from uavctl.records import ControlMode, Decision, Event, LinkStats, Order, Record, Severity, StepInput, Truth
 
 TICK_S = room().tick_s
 
@@ -173,7 +174,7 @@ def test_a_place_that_is_predicted_only_is_not_told_as_one_that_was_seen(
     assert any("predicted only" in value for _, value in list_summary_rows(summary)) == blind
     if blind:
         assert summary.final_age_s is not None and summary.final_std_m is not None
-        assert number(summary.final_age_s) in text and number(summary.final_std_m) in text
+        assert format_number(summary.final_age_s) in text and format_number(summary.final_std_m) in text
 
 
 def test_the_uncertainty_at_the_end_is_the_estimate_s_own() -> None:

@@ -9,7 +9,8 @@ import pytest
 from baseline_rig import problem
 
 from uavctl.arrays import Array
-from uavctl.records import GaveWay, SolveStatus, names_of, tell, worst
+from uavctl.constraint_names import describe_relaxed, find_worst, name_constraints
+from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
@@ -129,8 +130,8 @@ def test_first_rows_reach_an_input_set_that_is_no_box() -> None:
 
 
 def test_relaxed_constraints_are_described() -> None:
-    names = names_of(np.eye(2), 2, ("north",), (0,), (1,))
+    names = name_constraints(np.eye(2), 2, ("north",), (0,), (1,))
     slew = GaveWay(constraint="slew", stage=0, index=0, amount=0.4)
     state = GaveWay(constraint="state", stage=1, index=0, amount=0.01)
-    assert tell(names, slew) == "the limit of how fast the north setpoint changes gave way by 0.4 m/s²"
-    assert worst(names, (slew, state)) is state
+    assert describe_relaxed(names, slew) == "the limit of how fast the north setpoint changes gave way by 0.4 m/s²"
+    assert find_worst(names, (slew, state)) is state

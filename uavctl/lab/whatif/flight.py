@@ -37,7 +37,7 @@ from uavctl.loop import MOCAP, VEHICLE, ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
 from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
-from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, to_nobody
+from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, discard
 
 
 @dataclass(frozen=True)
@@ -353,7 +353,7 @@ class _ReflownLoop:
         if self._loop.outside == self._history.config.smpc.controller:
             self._loop.answered(record.answered_ns)
         self._tap.setpoint = None
-        ticked = self._loop.tick(record.tick, at_ns, to_nobody, record.missed_ticks, record.stop)
+        ticked = self._loop.tick(record.tick, at_ns, discard, record.missed_ticks, record.stop)
         self._loop.timing(ticked, lateness_ns=0, send_ns=0)
         self._steer_deviation(at_ns, ticked.decision.reason)
         self.record_truth(at_ns)
