@@ -27,6 +27,7 @@ from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
 from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
+from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
@@ -37,6 +38,8 @@ from uavctl.smpc.answer import Preview
 MISSION_OVER = "the mission is over: landing"
 # Behind a position that is older, and without a velocity of the vehicle's own beside them, inertial data make no plans:
 # nothing would show that they err. With five positions a second and 60 % of them lost, one in ten is older.
+# After a silence: positions correct the vehicle's own velocity in their first second, and are compared with it then.
+REENGAGE_NS = CORRECTS_NS + 400_000_000
 PLANNED_NS = 1_000_000_000
 CARRIES_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL = {
@@ -199,6 +202,10 @@ def _decide_plan(begun: Decided, phase: _Phase) -> Decided:
         reason = f"age of information {view.age_steps} has reached H = {controller.horizon}"
         return _fall_back(begun, begun.fallback or begin_fallback(at_ns), phase, reason)
     wanted = controller.fallback.recover_samples
+    resumed_ns = phase.supervised.monitors.engaged.motion.resumed_ns
+    if begun.fallback is not None and resumed_ns is not None and at_ns - resumed_ns < REENGAGE_NS:
+        reason = "positions have come back, and their first second is compared"
+        return _fall_back(begun, begun.fallback, phase, reason)
     if begun.fallback is not None and begun.consecutive_samples < wanted:
         reason = f"{begun.consecutive_samples} of {wanted} fresh samples in a row"
         return _fall_back(begun, begun.fallback, phase, reason)

@@ -35,14 +35,7 @@ from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import FilterView, TickContext, observe_motion, read_position, read_velocity, view_filter
-from uavctl.flight.estimator import (
-    FilterHistory,
-    distrust_inertial,
-    drop_samples,
-    make_estimate,
-    predict_ahead,
-    predict_belief,
-)
+from uavctl.flight.estimator import FilterHistory, distrust_inertial, drop_samples, make_estimate, predict_ahead
 from uavctl.flight.fallback import FallbackReason
 from uavctl.flight.kalman import Belief, read_capture_ns
 from uavctl.flight.limits import ZERO
@@ -51,6 +44,7 @@ from uavctl.flight.monitors import engaged, external, inertial, outside, vehicle
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import AnswerObservation, ExternalState, WallObservation
 from uavctl.flight.monitors.inertial import InertialObservation, Source
+from uavctl.flight.monitors.observation import MOTION_NS
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
@@ -66,6 +60,11 @@ REPLAN_STEPS = 3  # for which a plan is made anew once positions were dropped: t
 
 _ABSURD = end_plans(EventCode.OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
 _JUMPED = brake(EventCode.SAMPLE_JUMP, "positions jumped: braking until they are believed again, or not any more")
+_CONTRADICTED = brake(
+    EventCode.PREDICTION_INCONSISTENT,
+    "the vehicle's velocity and its inertial data contradict each other, and no position comes",
+)
+_CARRIED_BY_NOTHING = brake(EventCode.PREDICTION_INCONSISTENT, "neither positions nor inertial data come any more")
 _ABSURD_SO_FAR = brake(
     EventCode.POSITIONS_ABSURD,
     "positions are further out than any can be: braking until they are believed again, or not any more",
@@ -163,22 +162,12 @@ def _drop_after(history: FilterHistory, dropped_after_ns: int) -> FilterHistory:
 
 
 def _judge_inertial(state: ControlState, view: FilterView, context: TickContext) -> Verdict:
-    """Compare what inertial data have carried on without a position with the vehicle's own velocity."""
-    belief, motion, controller = view.belief, context.inputs.motion, context.controller
-    if belief is None or controller.envelope is None or motion is None or motion.velocity_ns is None:
+    """Judge inertial data that carry the estimate on without a position, as the monitor of changes found them."""
+    belief, change = view.belief, state.monitors.engaged.velocity_change
+    if belief is None or change.inertial_wrong_ns is None:
         return NO_VERDICT
-    trust = belief.inertial
-    if trust.distrusted_ns is not None or trust.used_ns is None or trust.used_ns <= belief.captured_ns:
-        return NO_VERDICT
-    # Both at the same time: the vehicle's velocity of a quarter of a second ago does not show how it moves now.
-    then = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns))
-    if then is None:
-        return NO_VERDICT
-    estimate = make_estimate(controller.kalman, then, with_cov=False)
-    observation = observe_velocity(state, state.monitors.engaged, estimate, context)
-    consistent = observation is None or vehicle_velocity.is_inertial_consistent(observation)
-    comparison = InertialObservation(Source.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
-    return inertial.update(trust, comparison)[1]
+    comparison = InertialObservation(Source.VEHICLE_VELOCITY, False, context.at_ns, belief.captured_ns)
+    return inertial.update(belief.inertial, comparison)[1]
 
 
 def observe_velocity(
@@ -273,7 +262,19 @@ def _judge_plan(
         return _JUMPED
     if context.controller.envelope is not None and _is_likely(sources.absurd):
         return _ABSURD_SO_FAR
-    return _judge_prediction(state, monitors, view, context)
+    verdict = _judge_silence(monitors, view, context)
+    return _judge_prediction(state, monitors, view, context) if verdict.is_none else verdict
+
+
+def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContext) -> Verdict:
+    """Judge whether a plan may fly on without positions: not where what carries the estimate on is wrong, or lost."""
+    if (view.age_steps or 0) < PLAYED_OUT_STEPS or view.belief is None:
+        return NO_VERDICT
+    change, trust = monitors.velocity_change, view.belief.inertial
+    if change.velocity_wrong_ns is not None or change.inertial_wrong_ns is not None:
+        return _CONTRADICTED
+    is_lost = trust.distrusted_ns is not None or context.at_ns - (trust.used_ns or context.at_ns) > MOTION_NS
+    return _CARRIED_BY_NOTHING if is_lost else NO_VERDICT
 
 
 def _is_likely(track: OutlierTrack | None) -> bool:

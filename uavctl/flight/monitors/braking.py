@@ -28,16 +28,22 @@ class BrakingState(msgspec.Struct, frozen=True):
     resumed_ns: int | None = None  # capture time of the first position after the last silence before that [ns]
 
 
-def update(state: BrakingState, observation: TickObservation) -> tuple[BrakingState, Verdict]:
-    """Take a tick."""
+def update(
+    state: BrakingState, observation: TickObservation, *, believes_velocity: bool
+) -> tuple[BrakingState, Verdict]:
+    """Take a tick.
+
+    Args:
+        believes_velocity: Whether the vehicle's own velocity may be believed; else it shows nothing.
+    """
     tick, motion = observation.tick, observation.motion
     if state.resumed_ns != motion.resumed_ns:  # positions that come back correct the vehicle's own velocity
         state = BrakingState(resumed_ns=motion.resumed_ns)
     if not tick.braking:
         return (state if state.began is None else BrakingState(resumed_ns=state.resumed_ns)), NO_VERDICT
-    velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
+    velocity = read_vehicle_velocity(tick.motion, tick.at_ns) if believes_velocity else None
     if velocity is None:
-        return state, NO_VERDICT
+        return BrakingState(resumed_ns=state.resumed_ns), NO_VERDICT
     speed_mps = math.hypot(*velocity)
     if state.began is None:
         return BrakingState((tick.at_ns, speed_mps), state.resumed_ns), NO_VERDICT

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
-from uavctl.flight.monitors import acceleration, braking, outside, velocity
+from uavctl.flight.monitors import acceleration, braking, outside, velocity, velocity_change
 from uavctl.flight.monitors.acceleration import AccelerationState
 from uavctl.flight.monitors.braking import BrakingState
 from uavctl.flight.monitors.motion import Motion, TickObservation, take_position, update_motion
@@ -21,6 +21,7 @@ from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, 
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.outside import OutsideState
 from uavctl.flight.monitors.velocity import VelocityState
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict
 from uavctl.records import PositionSample, Vec3
 
@@ -36,6 +37,7 @@ class MonitorState(msgspec.Struct, frozen=True, eq=False):
     velocity: VelocityState = VelocityState()
     outside: OutsideState = OutsideState()
     braking: BrakingState = BrakingState()
+    velocity_change: VelocityChangeState = VelocityChangeState()
     consistent_ns: int | None = None  # capture time of the last position at which all was quiet [ns]; None before any
     agreed: bool = False  # whether positions agreed with the vehicle's inertial data before the flight
 
@@ -66,8 +68,12 @@ def update(
     tick = TickObservation(observation, state.motion, parameters)
     velocity_state, unresolved = velocity.update_silence(state.velocity, tick)
     outside_state, is_out = outside.update(state.outside, tick)
-    braking_state, no_effect = braking.update(state.braking, tick)
-    state = replace(state, velocity=velocity_state, outside=outside_state, braking=braking_state)
+    change_state = velocity_change.update(state.velocity_change, tick, velocity_state)
+    believes_velocity = change_state.velocity_wrong_ns is None
+    braking_state, no_effect = braking.update(state.braking, tick, believes_velocity=believes_velocity)
+    state = replace(
+        state, velocity=velocity_state, outside=outside_state, braking=braking_state, velocity_change=change_state
+    )
     return state, _select_first(first, unresolved, is_out, no_effect)
 
 

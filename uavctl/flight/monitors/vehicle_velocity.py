@@ -47,11 +47,16 @@ def judge_vehicle_velocity(observation: VelocityObservation) -> Verdict:
 def find_trusted_velocity(observation: VelocityObservation) -> Vec3 | None:
     """Find the vehicle's own velocity where it may be braked on; None where it does not come, or nothing supports it.
 
-    Positions that agreed with it support it, the predicted velocity, and what was sent since a flight began.
+    Inertial data that change as it does support it, positions that agreed with it, the predicted velocity, and what was
+    sent since a flight began.
     """
     monitors, tick, parameters = observation.monitors, observation.tick, observation.parameters
     velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
-    if velocity is None or monitors.velocity.is_contradicted:
+    if velocity is None or monitors.velocity_change.velocity_wrong_ns is not None:
+        return None
+    if monitors.velocity_change.supports_velocity(tick.at_ns):
+        return velocity
+    if monitors.velocity.is_contradicted:
         return None
     # |v - v_predicted| ≤ v_max + gusts(age)
     within_mps = parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
@@ -86,7 +91,8 @@ def is_inertial_consistent(observation: VelocityObservation) -> bool:
 
 def find_confirmed_velocity(monitors: MonitorState, motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
     """Find the vehicle's own velocity where recent positions agree with it; else None."""
-    if monitors.velocity.is_contradicted or monitors.velocity.apart_mps is None:
+    is_distrusted = monitors.velocity.is_contradicted or monitors.velocity_change.velocity_wrong_ns is not None
+    if is_distrusted or monitors.velocity.apart_mps is None:
         return None
     return read_vehicle_velocity(motion, at_ns)
 

@@ -1,0 +1,273 @@
+"""Flights between walls whose data deceive in a silence of the cameras, judged on the true vehicle."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+from soak_pairs import compute_outside_m
+
+from sim.autopilot.inertial import InertialMeasurement
+from sim.cameras import Cameras
+from sim.simulation import World
+from uavctl.config import Config, load_config
+from uavctl.flight.controller import Controller
+from uavctl.frames import Quaternion
+from uavctl.lab.trial import get_cached_controller
+from uavctl.loop import ControlLoop
+from uavctl.records import Event, Record, Vec3
+
+SOURCES = ("velocity", "attitude", "inertial", "positions")
+KINDS = ("frozen", "scaled", "flipped", "swapped", "delayed")
+DELAY_S = 0.3
+SCALE = 0.3
+BLACKOUT_S = 4.0
+AFTER_S = 6.0  # that are flown after a blackout
+MOTION_MESSAGES = (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_ODOMETRY)
+
+
+@dataclass(frozen=True)
+class Deception:
+    """A source that deceives from a time on.
+
+    Attributes:
+        source: One of `SOURCES`.
+        kind: One of `KINDS`.
+        at_s: When it begins, since the start [s].
+    """
+
+    source: str
+    kind: str
+    at_s: float
+
+
+class ValueDistorter:
+    """Distorts the values (n,) of a source as a deception says."""
+
+    def __init__(self, kind: str) -> None:
+        self._kind = kind
+        self._kept: deque[tuple[float, tuple[float, ...]]] = deque()
+        self._frozen: tuple[float, ...] | None = None
+
+    def distort(self, at_s: float, value: Sequence[float], *, deceives: bool) -> tuple[float, ...]:
+        """Return the value that is sent at a time; all values are kept, so that a delay has some from before."""
+        values = tuple(map(float, value))
+        self._kept.append((at_s, values))
+        while len(self._kept) > 1 and self._kept[1][0] <= at_s - DELAY_S:
+            self._kept.popleft()
+        if not deceives:
+            return values
+        if self._frozen is None:
+            self._frozen = values
+        if self._kind == "frozen":
+            return self._frozen
+        if self._kind == "scaled":
+            return tuple(SCALE * number for number in values)
+        if self._kind == "flipped":
+            return (-values[0], -values[1], *values[2:])
+        if self._kind == "swapped":
+            return (values[1], values[0], *values[2:])
+        return self._kept[0][1]
+
+
+@dataclass
+class DeceivedFlight:
+    """What the truth has of a flight.
+
+    Attributes:
+        outside_m: Furthest beyond a wall or the ceiling; negative is inside [m].
+        outside_s: When that was, since the start [s].
+        speed_mps: Largest speed from the first deception on.
+        begin_mps: Speed when the first deception began.
+        codes: Codes of events, each with its first time [s].
+        modes: Changes of the control mode, each with its time [s].
+        mode: Mode of the autopilot in the end.
+    """
+
+    outside_m: float = -math.inf
+    outside_s: float = 0.0
+    speed_mps: float = 0.0
+    begin_mps: float = 0.0
+    codes: dict[str, float] | None = None
+    modes: list[tuple[float, str]] | None = None
+    mode: str = ""
+
+
+class _CodeSink:
+    def __init__(self) -> None:
+        self.codes: dict[str, float] = {}
+
+    def put(self, topic: str, at_ns: int, record: Record) -> None:
+        del topic
+        if isinstance(record, Event):
+            self.codes.setdefault(record.code, round(at_ns * 1e-9, 2))
+
+
+def prepare_believed(preset: str, autopilot: str, overrides: tuple[str, ...] = ()) -> tuple[Config, Controller]:
+    """Prepare the controller that flies."""
+    config = load_config(preset, [f"sim.autopilot={autopilot}", *overrides])
+    return config, get_cached_controller(config)
+
+
+def deceive(world: World, deceptions: Sequence[Deception], get_time_s: Callable[[], float]) -> None:
+    """Let sources of a simulated flight deceive."""
+    autopilot = world.peers.autopilot
+    sensors, streams = autopilot.inertial, autopilot.telemetry.streams
+    for deception in deceptions:
+        if deception.source == "velocity":
+            for message_id in MOTION_MESSAGES:
+                if message_id in streams:
+                    streams[message_id] = _wrap_velocity(streams[message_id], deception)
+        elif deception.source == "attitude":
+            estimate = _wrap_attitude(sensors.estimate_attitude, deception, get_time_s)
+            sensors.estimate_attitude = estimate  # type: ignore[method-assign]
+        elif deception.source == "inertial":
+            sensors.measure = _wrap_inertial(sensors.measure, deception)  # type: ignore[method-assign, assignment]
+        else:
+            _deceive_cameras(world.peers.cameras, deception)
+
+
+def _wrap_velocity(make: Callable[[int], Any], deception: Deception) -> Callable[[int], Any]:
+    distorter = ValueDistorter(deception.kind)
+
+    def make_distorted(at_ns: int) -> Any:
+        message = make(at_ns)
+        if message is not None:
+            true = (message.vx, message.vy, message.vz)
+            message.vx, message.vy, message.vz = distorter.distort(
+                at_ns * 1e-9, true, deceives=at_ns * 1e-9 >= deception.at_s
+            )
+        return message
+
+    return make_distorted
+
+
+def _wrap_attitude(
+    estimate: Callable[[], Quaternion], deception: Deception, get_time_s: Callable[[], float]
+) -> Callable[[], Quaternion]:
+    distorter = ValueDistorter(deception.kind)
+
+    def estimate_distorted() -> Quaternion:
+        w, x, y, z = estimate()
+        tilt = distorter.distort(get_time_s(), (x, y, z, w), deceives=get_time_s() >= deception.at_s)
+        norm = math.sqrt(sum(number * number for number in tilt)) or 1.0
+        x, y, z, w = (number / norm for number in tilt)
+        return w, x, y, z
+
+    return estimate_distorted
+
+
+def _wrap_inertial(
+    measure: Callable[[int], InertialMeasurement], deception: Deception
+) -> Callable[[int], InertialMeasurement]:
+    distorters = {unit: ValueDistorter(deception.kind) for unit in range(3)}
+
+    def measure_distorted(unit: int) -> InertialMeasurement:
+        true = measure(unit)
+        at_s = true[0] * 1e-9
+        north, east, down = distorters[unit].distort(at_s, true.force_mps2, deceives=at_s >= deception.at_s)
+        return true._replace(force_mps2=(north, east, down))
+
+    return measure_distorted
+
+
+def _deceive_cameras(cameras: Cameras, deception: Deception) -> None:
+    capture, distorter = cameras.capture, ValueDistorter(deception.kind)
+
+    def capture_distorted(position_m: Vec3, velocity_mps: Vec3, attitude: Quaternion) -> Any:
+        at_s = cameras.next_ns * 1e-9
+        north, east, down = distorter.distort(at_s, position_m, deceives=at_s >= deception.at_s)
+        return capture((north, east, down), velocity_mps, attitude)
+
+    cameras.capture = capture_distorted  # type: ignore[method-assign]
+
+
+def fly_deceived(
+    config: Config, believed: Config, controller: Controller, deceptions: Sequence[Deception], blackout_s: float | None
+) -> DeceivedFlight:
+    """Fly with sources that deceive.
+
+    Args:
+        config: Of the world.
+        believed: Of the controller.
+        blackout_s: When the blackout of the world begins; None for none.
+    """
+    sink, flight = _CodeSink(), DeceivedFlight()
+    modes: list[tuple[float, str]] = []
+    begin_s = min([deception.at_s for deception in deceptions] + ([] if blackout_s is None else [blackout_s]))
+    loop = ControlLoop(believed, controller, sink, lambda: 0)
+    time_s = 0.0
+
+    class Watch:
+        def receive(self, link: str, data: bytes, at_ns: int) -> Any:
+            return loop.receive(link, data, at_ns)
+
+        def tick(self, tick: int, at_ns: int, send: Any) -> object:
+            nonlocal time_s
+            time_s = at_ns * 1e-9
+            vehicle = world.peers.vehicle
+            speed_mps = math.hypot(*vehicle.velocity_mps)
+            outside_m = compute_outside_m(config, vehicle.position_m)
+            if time_s >= begin_s:
+                if outside_m > flight.outside_m:
+                    flight.outside_m, flight.outside_s = outside_m, time_s
+                flight.begin_mps = flight.begin_mps or speed_mps
+                flight.speed_mps = max(flight.speed_mps, speed_mps)
+            ticked = loop.tick(tick, at_ns, send)
+            mode = ticked.decision.mode
+            if not modes or modes[-1][1] != mode:
+                modes.append((round(time_s, 2), mode))
+            return ticked
+
+    world = World(config, Watch())
+    deceive(world, deceptions, lambda: time_s)
+    world.run(config.duration_s)
+    flight.codes, flight.modes = sink.codes, modes
+    flight.mode = world.peers.autopilot.mode_name
+    return flight
+
+
+def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float]:
+    """Draw a flight: preset, autopilot, gusts, path between walls, a blackout, and one or two deceptions."""
+    rng = np.random.default_rng([seed, 39])
+    autopilot = ("px4", "ardupilot")[seed % 2]
+    preset = (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
+    believed, controller = prepare_believed(preset, autopilot)
+    lower = [believed.sets.state_lower[i * (len(believed.sets.state_lower) // 3)] for i in range(3)]
+    upper = [believed.sets.state_upper[i * (len(believed.sets.state_upper) // 3)] for i in range(3)]
+    height = -float(rng.uniform(0.8, 1.6))
+    sides = [(0.9 * lower[0], 0.9 * lower[1]), (0.9 * upper[0], 0.9 * upper[1])]
+    if rng.random() < 0.5:
+        sides = [(0.9 * lower[0], 0.9 * upper[1]), (0.9 * upper[0], 0.9 * lower[1])]
+    corners = [*sides, *sides, *sides]
+    waypoints = ", ".join(f"[{n:.2f}, {e:.2f}, {height:.2f}]" for n, e in corners)
+    blackout_s = float(rng.uniform(3.0, 10.0))
+    size = 1 + int(rng.random() < 0.5)
+    sources = rng.choice(len(SOURCES), size, replace=False)
+    deceptions = [
+        Deception(
+            SOURCES[source],
+            KINDS[int(rng.integers(len(KINDS)))],
+            blackout_s + float(rng.uniform(-1.0, 0.0) if rng.random() < 0.7 else rng.uniform(0.0, 2.0)),
+        )
+        for source in sources
+    ]
+    config = load_config(
+        preset,
+        [
+            f"sim.autopilot={autopilot}",
+            f"sim.seed={seed}",
+            "sim.plant=quadrotor",
+            f"mission.waypoints=[{waypoints}]",
+            f"sim.wind.gust_wind_mps={rng.uniform(0.0, 3.0):.2f}",
+            f"link.blackout=[[{blackout_s}, {blackout_s + BLACKOUT_S}]]",
+            f"duration_s={blackout_s + BLACKOUT_S + AFTER_S}",
+        ],
+    )
+    believed, controller = prepare_believed(preset, autopilot, (f"mission.waypoints=[{waypoints}]",))
+    return config, believed, controller, deceptions, blackout_s

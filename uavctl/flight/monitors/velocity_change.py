@@ -1,0 +1,140 @@
+"""Monitor: do the vehicle's own velocity and its inertial data change alike? If not, which of them is wrong?
+
+1. Over the last second, or since they last were compared, three changes of the velocity are known: of the vehicle's own
+   velocity (Δv), the integral of its inertial data (Δi), and what the setpoints give (Δm). None needs a position.
+2. Δv and Δi that are near each other are both right: then positions that contradict them are wrong.
+3. Else the one that is further from Δm is wrong, with or without the acceleration d that positions showed last beside
+   the setpoints; both are, if both are further than gusts explain.
+4. An own velocity that repeats to the last bit while Δm grows is wrong, too.
+
+A wrong velocity is not braked on, and wrong inertial data do not carry the estimate on. Where no position comes, the
+vehicle brakes (`uavctl.flight.supervise`). Wrong inertial data are compared again after three seconds, a wrong velocity
+once positions have agreed with it. While positions that come back correct the vehicle's own velocity, nothing is
+compared.
+
+False alarms (docs/soak.md): none in 200 missions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from uavctl.flight.monitors.motion import TickObservation, bound_gusts_mps
+from uavctl.flight.monitors.observation import EnvelopeParameters, read_vehicle_velocity
+from uavctl.flight.monitors.velocity import CORRECTS_NS, VelocityState
+from uavctl.records import Vector
+
+WINDOW_NS = 1_000_000_000  # longer integrals of inertial data drift, over shorter ones a change is small
+PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one message may be late
+INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
+INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
+RECENT_NS = 300_000_000  # an agreement counts for so long
+
+Sample = tuple[int, Vector, Vector, Vector]  # time [ns]; own velocity, integral of inertial data, model's [m/s]
+
+
+class VelocityChangeState(msgspec.Struct, frozen=True):
+    """State of the monitor."""
+
+    samples: tuple[Sample, ...] = ()  # of the window, oldest first
+    agreed_ns: int | None = None  # when both changes last agreed [ns]; None before
+    disagrees_ns: int | None = None  # time since which they do not [ns]; None while they do
+    repeated: tuple[Vector, Vector] | None = None  # the own velocity when it first came, and the model's then
+    velocity_wrong_ns: int | None = None  # when the own velocity was found wrong [ns]; None while it is not
+    inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
+
+    def supports_velocity(self, at_ns: int) -> bool:
+        """Whether inertial data have changed as the own velocity has, just now."""
+        return self.velocity_wrong_ns is None and self.agreed_ns is not None and at_ns - self.agreed_ns <= RECENT_NS
+
+
+def update(state: VelocityChangeState, observation: TickObservation, velocity: VelocityState) -> VelocityChangeState:
+    """Take a tick, after its positions."""
+    tick, motion, parameters = observation.tick, observation.motion, observation.parameters
+    state = _believe_again(state, tick.at_ns, velocity, parameters)
+    own = read_vehicle_velocity(tick.motion, tick.at_ns)
+    own_ns = None if tick.motion is None else tick.motion.velocity_ns
+    is_corrected = motion.resumed_ns is not None and tick.at_ns < motion.resumed_ns + CORRECTS_NS
+    if own is None or own_ns is None or is_corrected:
+        return replace(state, samples=(), disagrees_ns=None, repeated=None)
+    state = _find_repeats(state, own, motion.model_mps, tick.at_ns, parameters)
+    if not motion.inertial_path or tick.inertial_mps2 is None:
+        return replace(state, samples=(), disagrees_ns=None)
+    if state.samples and state.samples[-1][0] >= own_ns:
+        return state
+    gained, _ = motion.inertial_path[-1].integrate(own_ns)
+    kept = tuple(sample for sample in state.samples if own_ns - sample[0] <= WINDOW_NS)
+    sample = (own_ns, own, tuple(gained), motion.model_mps)
+    state = replace(state, samples=(*kept, sample))
+    if state.velocity_wrong_ns is not None or state.inertial_wrong_ns is not None:
+        return state
+    unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
+    return _compare(state, kept[0] if kept else sample, sample, unexplained, tick.at_ns, parameters)
+
+
+def _compare(
+    state: VelocityChangeState,
+    first: Sample,
+    last: Sample,
+    unexplained_mps2: Vector,
+    at_ns: int,
+    parameters: EnvelopeParameters,
+) -> VelocityChangeState:
+    """Compare both changes since the first sample of the window; where they differ, find the wrong one.
+
+    Args:
+        unexplained_mps2: Acceleration that positions showed last beside the setpoints: wind and drag.
+    """
+    s = (last[0] - first[0]) * 1e-9
+    own, gained, model = (_subtract(now, then) for now, then in zip(last[1:], first[1:], strict=True))
+    # |Δv - Δi| ≤ v_max + 0.3 m/s² t
+    if math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
+        return replace(state, agreed_ns=at_ns, disagrees_ns=None)
+    disagrees_ns = at_ns if state.disagrees_ns is None else state.disagrees_ns
+    if at_ns - disagrees_ns < PERSISTS_NS:
+        return replace(state, disagrees_ns=disagrees_ns)
+    # e_v = min(|Δv - Δm|, |Δv - Δm - d t|), e_i likewise: positions that were wrong have given a wrong d
+    pushed = tuple(change + accel * s for change, accel in zip(model, unexplained_mps2, strict=True))
+    own_mps, gained_mps = (min(math.dist(shown, model), math.dist(shown, pushed)) for shown in (own, gained))
+    # v_max + gusts(t)
+    explained_mps = 2.0 * (parameters.disagreement_mps + bound_gusts_mps(s, parameters))
+    are_both_wrong = min(own_mps, gained_mps) > explained_mps
+    return replace(
+        state,
+        disagrees_ns=disagrees_ns,
+        velocity_wrong_ns=at_ns if are_both_wrong or own_mps >= gained_mps else None,
+        inertial_wrong_ns=at_ns if are_both_wrong or own_mps < gained_mps else None,
+    )
+
+
+def _find_repeats(
+    state: VelocityChangeState, own: Vector, model: Vector, at_ns: int, parameters: EnvelopeParameters
+) -> VelocityChangeState:
+    """Find an own velocity that repeats to the last bit while that by the setpoints changes."""
+    if state.repeated is None or state.repeated[0] != own:
+        return replace(state, repeated=(own, model))
+    if math.dist(model, state.repeated[1]) <= parameters.disagreement_mps or state.velocity_wrong_ns is not None:
+        return state
+    return replace(state, velocity_wrong_ns=at_ns)
+
+
+def _believe_again(
+    state: VelocityChangeState, at_ns: int, velocity: VelocityState, parameters: EnvelopeParameters
+) -> VelocityChangeState:
+    """Believe inertial data again after a time, and an own velocity once positions have agreed with it."""
+    velocity_ns, inertial_ns = state.velocity_wrong_ns, state.inertial_wrong_ns
+    if inertial_ns is not None and at_ns - inertial_ns > INERTIAL_DISTRUST_NS:
+        state = replace(state, inertial_wrong_ns=None, samples=())
+    if velocity_ns is None or velocity.apart_mps is None or velocity.offsets[0][0] <= velocity_ns:
+        return state
+    if velocity.apart_mps <= parameters.disagreement_mps:
+        state = replace(state, velocity_wrong_ns=None, samples=())
+    return state
+
+
+def _subtract(a: Sequence[float], b: Sequence[float]) -> Vector:
+    return tuple(x - y for x, y in zip(a, b, strict=True))
