@@ -150,13 +150,18 @@ def read_trajectory_file(
     return msgspec.structs.replace(mission, trajectory=samples), places
 
 
+# A cell of a header, without separators outside of brackets. A bracket without its end goes on to the end of the line:
+# a pattern that fails there would begin again at every later bracket, and take quadratic time.
+_HEADER_CELL = re.compile(r"(?:[^,\s\[(]|[\[(][^\])]*[\])]?)+")
+
+
 def _read_rows(path: Path) -> list[tuple[int, Floats]]:
     """Line number and values of each row, as t, x, y, z and vx, vy, vz in s, m and m/s, all of the same width."""
     rows: list[tuple[int, list[str]]] = []
     for number, line in enumerate(read_lines(path), 1):
         text = line.strip()
         if text.startswith("#"):  # a comment, or a header in one
-            cells = re.split(r"[,\s]+(?![^\[(]*[\])])", text.lstrip("# ").strip())
+            cells = _HEADER_CELL.findall(text.lstrip("# "))
             if rows or len(cells) < _POSITION_COLUMNS or not all(parse_heading(cell) for cell in cells):
                 continue
             text = ",".join(cells)
