@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from logs.recording.budget import read_whole
 from logs.recording.disk import describe_kind_error, refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.export import Watch, count_messages, ignore_progress
 from logs.recording.reader import RecordedMessage, good_messages, header
@@ -171,10 +172,7 @@ def read_tlog(path: Path) -> Tlog:
     Raises:
         RecordingError: The file cannot be read, holds no packet, its packets have no stamps, or stamps without a time.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
+    data = bytes(read_whole(path))
     cutter = _Cutter(data, _STAMP)
     note: tuple[str, ...] = ()
     if 2 * cutter.skipped_bytes > len(data) or not cutter.packets:
