@@ -21,9 +21,9 @@ MAX_CHUNK_BYTES = 2**28  # of one chunk, unpacked: all of it is in memory; recor
 # Bytes of a file for each record in its chunks: number and time of a message change, so that it packs to no less.
 MIN_RECORD_BYTES = 2
 FREE_RECORDS = 2**16
-# Bytes that may be kept in memory for a byte of the file: a frame changes in number and checksum, and packs to a
-# thirtieth if it has the greatest length and its values stand still.
-MAX_KEPT_RATIO = 32
+# Bytes that may be kept in memory for a byte of the file. A frame changes in number and checksum: with its place in
+# memory it packs to a thirtieth if it has the greatest length and its values stand still; twice that to be safe.
+MAX_KEPT_RATIO = 64
 
 
 # Of a file that is read as a whole. A fast link brings a megabyte a second, which makes 3.6 GB in an hour.

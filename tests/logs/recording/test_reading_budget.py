@@ -21,7 +21,16 @@ from msgspec.structs import replace
 from recording_fakes import HEADER, Clock, record_flight
 from work_rig import limit_calls, limit_checksums, limit_memory
 
-from logs.recording.budget import FREE_BYTES, FREE_RECORDS, MAX_LOOKS, MAX_RATIO, ExcessError, ReadBudget, read_whole
+from logs.recording.budget import (
+    FREE_BYTES,
+    FREE_RECORDS,
+    MAX_KEPT_RATIO,
+    MAX_LOOKS,
+    MAX_RATIO,
+    ExcessError,
+    ReadBudget,
+    read_whole,
+)
 from logs.recording.disk import DiskFile
 from logs.recording.foreign import UnreadableError, make_unwrapper, read_mcap
 from logs.recording.reader import (
@@ -216,6 +225,15 @@ def test_messages_of_other_topics_are_bounded_in_number_and_memory(tmp_path: Pat
         read_mcap(path)
 
 
+@pytest.mark.fault(96)
+def test_what_is_kept_of_mavlink_is_bounded(tmp_path: Path) -> None:
+    (row,) = rows_of(TLOGS[0])[:1]
+    kept = hostile.message(1, row[3].ljust(500, b"\0")) * 62_000
+    path = put(tmp_path, hostile.MAGIC + hostile.chunk(hostile.channel(1, 0, "/m", "x") + kept))
+    with pytest.raises(RecordingError, match="as no MAVLink does"):
+        read_mcap(path)
+
+
 def test_records_that_are_not_used_are_not_kept_in_memory(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", rows_of(TLOGS[0])[:10], finish=False, use_chunking=False)
     path.write_bytes(path.read_bytes() + hostile.record(Opcode.ATTACHMENT, bytes(2**24)))
@@ -311,7 +329,12 @@ def test_devices_are_not_read(device: str) -> None:
 
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 10**6), max_size=50))
 def test_a_budget_is_never_overdrawn(size: int, lengths: list[int]) -> None:
-    for name, most in (("look", MAX_LOOKS * size), ("unpack", FREE_BYTES + MAX_RATIO * size)):
+    limits = {
+        "look": MAX_LOOKS * size,
+        "unpack": FREE_BYTES + MAX_RATIO * size,
+        "keep": FREE_BYTES + MAX_KEPT_RATIO * size,
+    }
+    for name, most in limits.items():
         budget, taken = ReadBudget(size), 0
         for length in lengths:
             try:
