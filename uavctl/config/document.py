@@ -61,19 +61,23 @@ def find_excess(text: str) -> tuple[int, str] | None:
     """
     if len(text) > MAX_BYTES:
         return 1, f"is longer than {MAX_BYTES} characters"
-    if text.count(",") + text.count("\n") > MAX_VALUES:
+    values = text.count(",") + text.count("\n")
+    if values > MAX_VALUES:
         return 1, f"has more than {MAX_VALUES} lines and commas"
     depth = dots = 0
     for match in _MARK.finditer(text):
         depth += (match.lastgroup == "open") - (match.lastgroup == "close")
         if match.lastgroup == "dot":
             dots += 1
+            values += dots > 1  # each is a table; a number has one dot at most
         elif match.lastgroup is not None:  # between strings the same key goes on
             dots = 0
-        if depth > MAX_DEPTH or dots >= MAX_DEPTH:
+        if depth > MAX_DEPTH or dots >= MAX_DEPTH or values > MAX_VALUES:
             line = text.count("\n", 0, match.start()) + 1
             if depth > MAX_DEPTH:
                 return line, f"brackets are nested more than {MAX_DEPTH} deep, or not closed"
+            if values > MAX_VALUES:
+                return line, f"has more than {MAX_VALUES} lines, commas and parts of dotted keys up to here"
             return line, f"a dotted key is nested more than {MAX_DEPTH} deep"
     return None
 
