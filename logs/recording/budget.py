@@ -76,7 +76,7 @@ class ReadBudget:
             ExcessError: There were too many.
         """
         if self._records_left <= 0:
-            raise ExcessError(f"makes the file have a record in every {MIN_RECORD_BYTES} bytes, as no recording has")
+            raise ExcessError(f"brings more records than one for every {MIN_RECORD_BYTES} bytes of the file")
         self._records_left -= 1
 
     def keep(self, length: int) -> None:

@@ -122,7 +122,7 @@ def test_a_chunk_has_no_more_messages_than_bytes_allow(tmp_path: Path) -> None:
     items = list(scan(path))
     messages = [item for item in items if isinstance(item, RecordedMessage)]
     assert len(messages) <= FREE_RECORDS + path.stat().st_size
-    assert any(isinstance(item, Damage) and "record" in item.reason for item in items)
+    assert any(isinstance(item, Damage) and "brings more records" in item.reason for item in items)
 
 
 @pytest.mark.fault(96)
@@ -205,7 +205,7 @@ def test_a_whole_recording_is_looked_at_in_proportion(tmp_path: Path) -> None:
 def test_a_foreign_file_unpacks_to_no_more_than_its_bytes_allow(compression: str, tmp_path: Path) -> None:
     path = put(tmp_path, hostile.make_bomb(100_000, compression))
     limit_bytes = FREE_BYTES + (MAX_RATIO + 1) * path.stat().st_size
-    with limit_checksums(limit_bytes), pytest.raises(RecordingError, match=r"flight.mcap, offset 8: a record makes"):
+    with limit_checksums(limit_bytes), pytest.raises(RecordingError, match=r"p, offset 8: a record (makes|brings) "):
         read_mcap(path)
 
 
@@ -221,7 +221,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(compression: str, 
 def test_messages_of_other_topics_are_bounded_in_number_and_memory(tmp_path: Path) -> None:
     content = hostile.channel(1, 0, "/m", "x") + hostile.message(1, b"\xfe") * 800_000
     path = put(tmp_path, hostile.MAGIC + hostile.chunk(content))
-    with limit_memory(2 * len(content) + FREE_BYTES), pytest.raises(RecordingError, match="as no recording has"):
+    with limit_memory(2 * len(content) + FREE_BYTES), pytest.raises(RecordingError, match="brings more records"):
         read_mcap(path)
 
 
