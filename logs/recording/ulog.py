@@ -249,7 +249,9 @@ class _Reader:
         return max(0, int(at_us) - self._origin_us) * 1e-6
 
     def _seconds(self, fields: dict[str, Any]) -> Array:
-        return np.asarray((fields["timestamp"].astype(np.int64) - self._origin_us) * 1e-6, dtype=np.float64)
+        # Stamps of 64 bits without a sign; their differences have one.
+        since_us = (fields["timestamp"].astype(np.uint64) - np.uint64(self._origin_us)).view(np.int64)
+        return np.asarray(since_us * 1e-6, dtype=np.float64)
 
     def _read_own_positions(self) -> tuple[str, list[tuple[int, Any, Any]]]:
         """Return the name and the points of its own position: in local NED, else on the globe."""
