@@ -6,7 +6,6 @@ or replayed from it.
 
 from __future__ import annotations
 
-import tomllib
 from functools import cache
 from importlib import resources
 
@@ -14,7 +13,8 @@ import msgspec
 from mcap.records import Attachment, Metadata
 
 from logs.recording.parameters import ParameterReader, count_parameters, make_parameter_file
-from uavctl.config.load import flatten_keys
+from uavctl.config.load import flatten_keys, parse_stored_toml
+from uavctl.errors import ConfigError
 from uavctl.records import Header
 
 CONFIG, LAYOUT, PARAMETERS = "config.toml", "foxglove-layout.json", "vehicle.params"
@@ -74,8 +74,8 @@ def _make_file(name: str, media_type: str, text: str, utc_ns: int) -> Attachment
 def _flatten(text: str) -> dict[str, str]:
     """Return a configuration by dotted names, its values as JSON; nothing if it is damaged."""
     try:
-        return {key: _format_value(value) for key, value in flatten_keys(tomllib.loads(text))}
-    except tomllib.TOMLDecodeError:
+        return {key: _format_value(value) for key, value in flatten_keys(parse_stored_toml(text, "configuration"))}
+    except ConfigError:
         return {}
 
 

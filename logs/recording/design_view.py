@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from uavctl.arrays import Array
 from uavctl.constraint_names import ConstraintNames, name_constraints
-from uavctl.errors import RecordingError
+from uavctl.errors import ConfigError, RecordingError
 from uavctl.records import Header, Matrix, Vec3, Vector
 
 AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}
@@ -184,8 +183,8 @@ def read_design(header: Header) -> DesignView:
 def _get_free_input(header: Header) -> float:
     """Return how much of each input plans leave free to act against a bias [input units]."""
     try:
-        estimator = tomllib.loads(header.config_toml).get("estimator", {})
-    except tomllib.TOMLDecodeError:
+        estimator = parse_stored_toml(header.config_toml, "configuration").get("estimator", {})
+    except ConfigError:
         return 0.0  # the page shows the damaged text, and limits that are cautious
     return float(estimator.get("bias_max", 0.0))
 
@@ -193,7 +192,7 @@ def _get_free_input(header: Header) -> float:
 def get_config_name(header: Header) -> str | None:
     """Return the name in a recording's configuration; None if there is none, or the TOML is damaged."""
     try:
-        name = tomllib.loads(header.config_toml).get("name")
-    except tomllib.TOMLDecodeError:
+        name = parse_stored_toml(header.config_toml, "configuration").get("name")
+    except ConfigError:
         return None
     return name if isinstance(name, str) else None

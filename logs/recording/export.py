@@ -13,7 +13,6 @@ A missing value, and a place beyond a shorter list's end, is an empty cell.
 from __future__ import annotations
 
 import csv
-import struct
 import types
 import typing
 from collections import Counter
@@ -27,11 +26,9 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import msgspec
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 
 from logs.recording.disk import refuse_existing_files, remove_on_error, write_temporary_files
-from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
+from logs.recording.reader import RecordedMessage, count_by_topic, good_messages, lacks_end, segment_files
 from logs.recording.topics import HEADER, LIBRARY, decode, get_record_type, is_known, is_view
 from uavctl.config.load import find_nearest
 from uavctl.errors import RecordingError, need
@@ -290,17 +287,10 @@ def count_messages(flight: Path) -> int | None:
     number = 0
     for index, path in enumerate(segment_files(flight)):
         left_out = {HEADER, LIBRARY} if index else set()  # which later files repeat
-        try:
-            with path.open("rb") as file:
-                summary = make_reader(file).get_summary()
-        except (OSError, McapError, ValueError, struct.error):
+        counts = count_by_topic(path)
+        if counts is None:
             return None  # whoever reads on will say what is wrong
-        if summary is None or summary.statistics is None:
-            return None
-        for channel, messages in summary.statistics.channel_message_counts.items():
-            topic = summary.channels[channel].topic if channel in summary.channels else ""
-            if not is_view(topic) and topic not in left_out:
-                number += messages
+        number += sum(messages for topic, messages in counts.items() if not is_view(topic) and topic not in left_out)
     return number
 
 

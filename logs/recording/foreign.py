@@ -9,17 +9,22 @@ from __future__ import annotations
 
 import re
 import struct
+import zlib
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]
 import zstandard
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import InvalidMagic, McapError, UnsupportedCompressionError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, DataEnd, Schema
 
+from logs.recording.budget import ExcessError, ReadBudget
 from logs.recording.disk import MAGIC, FileKind, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, flight_in
 from logs.recording.summary import count
@@ -72,6 +77,9 @@ _BORDER = re.compile(r"^=+\s*$", re.MULTILINE)
 _HEAD_BYTES = 4  # of CDR
 _ORDERS = {0: ">", 1: "<", 6: ">", 7: "<"}  # second byte of CDR: XCDR1 and XCDR2, plain
 _ALIGNED_MOST = {0: 8, 1: 8, 6: 4, 7: 4}
+# Of reading a message, at most: a value has a byte at least; alone in a type, in a list, it is reached in three steps.
+_MAX_STEPS_PER_BYTE, _FREE_STEPS = 4, 64
+_MAX_DEPTH = 64  # of types within types
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _SIGNATURE_BYTES = 13
@@ -156,12 +164,17 @@ def _parse_field(line: str, owner: str) -> _RosField | None:
 
 
 class _RosReader:
-    """Reader of one serialised ROS message."""
+    """Reader of one serialised ROS message.
+
+    A definition may nest types that have no bytes, or lists of them: the steps of reading are bounded by the bytes.
+    """
 
     def __init__(self, data: bytes, types: Mapping[str, list[_RosField]], encoding: str) -> None:
         self._types, self._cdr = types, encoding == ROS2
         self._order, self._aligned_most = "<", 1
         self._at, self._data = 0, data
+        self._steps_left = _FREE_STEPS + _MAX_STEPS_PER_BYTE * len(data)
+        self._depth = 0
         if self._cdr:
             if len(data) < _HEAD_BYTES or data[0] or data[1] not in _ORDERS:
                 raise UnreadableError("its first bytes are not those of CDR")
@@ -172,9 +185,15 @@ class _RosReader:
         """Read all fields of a type."""
         if kind not in self._types:
             raise UnreadableError(f"its definition says nothing of {kind}")
-        return {field.name: self._field(field) for field in self._types[kind]}
+        if self._depth >= _MAX_DEPTH:
+            raise UnreadableError(f"its definition nests more than {_MAX_DEPTH} deep")
+        self._depth += 1
+        fields = {field.name: self._field(field) for field in self._types[kind]}
+        self._depth -= 1
+        return fields
 
     def _field(self, field: _RosField) -> Value:
+        self._take_step()
         if field.size is None:
             return self._read_value(field.type)
         length = field.size or self._number("I")
@@ -185,7 +204,13 @@ class _RosReader:
             return [self._read_value(field.type) for _ in range(length)]
         return list(self._numbers(letter, length))
 
+    def _take_step(self) -> None:
+        if self._steps_left <= 0:
+            raise UnreadableError("it has far more fields, by its definition, than bytes")
+        self._steps_left -= 1
+
     def _read_value(self, kind: str) -> Value:
+        self._take_step()
         if kind in _NUMBERS:
             return self._number(_NUMBERS[kind])
         if kind in _STAMPS:
@@ -297,9 +322,13 @@ def cut_stream(pieces: list[tuple[int, bytes]]) -> FrameStream:
 
 _OURS = "/uavctl/"
 _MAX_NAMED_CHANNELS = 12  # channels that an error names
+_PIECE_BYTES = 64  # of memory for each piece of a stream, besides its bytes
 _PROBED_BYTES = 65_536  # without a frame in so many a channel holds something else
 # What the library raises on bytes that are no MCAP: its own, and those of the formats within.
 _DAMAGE = (McapError, ValueError, OverflowError, RuntimeError, struct.error, zstandard.ZstdError)
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")  # opcode, length; channel, sequence, times
+_BLOCK_BYTES = 2**20  # of a record that is passed over, read at once
+_LOADED = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.DATA_END))
 
 
 @dataclass(frozen=True)
@@ -317,16 +346,24 @@ class _ChannelStream:
 
     Args:
         schema: Schema of the channel's messages, if they have one.
-        wanted: It was asked for, so it is read however little MAVLink is in it.
+        unwrap: Makes a frame of each message, if they are MAVLink wrapped by ROS.
+        is_requested: It was asked for, so it is read however little MAVLink is in it.
+        budget: Bounds what is kept.
     """
 
-    def __init__(self, channel: Channel, schema: Schema | None, *, is_requested: bool) -> None:
+    def __init__(
+        self,
+        channel: Channel,
+        schema: Schema | None,
+        unwrap: Callable[[bytes], bytes] | None,
+        *,
+        is_requested: bool,
+        budget: ReadBudget,
+    ) -> None:
         self.topic, self.encoding = channel.topic, channel.message_encoding
         self.kind = "" if schema is None else schema.name
         self.messages = 0
-        self._unwrap: Callable[[bytes], bytes] | None = None
-        if schema is not None:
-            self._unwrap = make_unwrapper(self.encoding, schema.encoding, schema.name, schema.data)
+        self._unwrap, self._budget = unwrap, budget
         self._is_requested = is_requested
         self._pieces: list[tuple[int, bytes]] = []
         self._probe: bytearray | None = None if is_requested or self._unwrap else bytearray()
@@ -344,6 +381,9 @@ class _ChannelStream:
             except UnreadableError as error:
                 self._unreadable, self._reason = self._unreadable + 1, str(error)
                 return
+        if not data:
+            return
+        self._budget.keep(_PIECE_BYTES + len(data))
         self._pieces.append((at_ns, data))
         if self._probe is not None:
             self._inspect(data)
@@ -402,7 +442,8 @@ def is_foreign(path: Path) -> bool:
             if file.read(len(MAGIC)) != MAGIC:
                 return False
             file.seek(0)
-            for record in _iterate_records(file, path.stat().st_size):
+            size = path.stat().st_size
+            for record in _iterate_records(file, size, ReadBudget(size)):
                 if isinstance(record, Channel):
                     has_messages = True
                     if record.topic.startswith(_OURS):
@@ -411,7 +452,7 @@ def is_foreign(path: Path) -> bool:
         return False  # a recording of ours may have later segments only; of a folder its reader knows what to do
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
-    except _DAMAGE:
+    except (*_DAMAGE, ExcessError, _TornError):
         return has_messages
     return has_messages
 
@@ -433,6 +474,10 @@ def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
             torn = _collect_messages(file, path.stat().st_size, topics, streams)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
+    except ExcessError as error:
+        raise RecordingError(
+            f"{path}, {error}; do not trust it, or write its MAVLink alone into another file"
+        ) from error
     except _DAMAGE as error:
         raise RecordingError(f"{path}: damaged, or no MCAP ({error}); mcap's own tool may recover it") from error
     _check_names(path, topics, streams)
@@ -452,32 +497,153 @@ def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
     return ForeignMcap(sort_packets(packets), tuple(dict.fromkeys(used_topics)), torn, tuple(notes))
 
 
+class _Message(NamedTuple):
+    """A message of a channel."""
+
+    channel_id: int
+    at_ns: int
+    data: bytes
+
+
+class _TornError(Exception):
+    """The file ends within a record."""
+
+
 def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
     """Take the messages of some topics, or of all if none is given; return whether the file is torn."""
     schemas: dict[int, Schema] = {}
+    unwrappers: dict[tuple[int, str], Callable[[bytes], bytes] | None] = {}  # by schema and encoding of messages
+    budget = ReadBudget(size)
     try:
-        for record in _iterate_records(file, size):
-            if isinstance(record, Schema):
+        for record in _iterate_records(file, size, budget):
+            if isinstance(record, _Message):
+                stream = streams.get(record.channel_id)
+                if stream is not None and (not topics or stream.topic in topics):
+                    stream.take(record.at_ns, record.data)
+            elif isinstance(record, Schema):
+                if schemas.get(record.id) != record:
+                    unwrappers = {key: unwrap for key, unwrap in unwrappers.items() if key[0] != record.id}
                 schemas[record.id] = record
-            elif isinstance(record, Channel) and record.id not in streams:
+            elif record.id not in streams:
+                schema, encoding = schemas.get(record.schema_id), record.message_encoding
+                key = (record.schema_id, encoding)
+                if schema is not None and key not in unwrappers:
+                    unwrappers[key] = make_unwrapper(encoding, schema.encoding, schema.name, schema.data)
                 streams[record.id] = _ChannelStream(
-                    record, schemas.get(record.schema_id), is_requested=record.topic in topics
+                    record, schema, unwrappers.get(key), is_requested=record.topic in topics, budget=budget
                 )
-            elif isinstance(record, Message) and record.channel_id in streams:
-                stream = streams[record.channel_id]
-                if not topics or stream.topic in topics:
-                    stream.take(record.log_time or record.publish_time, record.data)
-    except (EndOfFile, struct.error):
-        if file.read(1):
-            raise
+    except _TornError:
         return True
     return False
 
 
-def _iterate_records(file: BinaryIO, size: int) -> Iterator[object]:
-    """Yield channels and messages in file order; each chunk is checked by its checksum if it has one."""
-    # A damaged length must not ask for more memory than the file has bytes.
-    yield from StreamReader(file, validate_crcs=True, record_size_limit=size).records
+def _iterate_records(file: BinaryIO, size: int, budget: ReadBudget) -> Iterator[Schema | Channel | _Message]:
+    """Yield schemas, channels and messages in file order; each chunk is checked by its checksum if it has one.
+
+    Args:
+        size: Size of the file: no length that it claims is believed beyond.
+
+    Raises:
+        _TornError: The file ends within a record.
+        ExcessError: A record asks for more than the budget has; names its offset.
+    """
+    at, checksum = len(MAGIC), zlib.crc32(MAGIC)
+    if (begin := file.read(len(MAGIC))) != MAGIC:
+        raise InvalidMagic(begin)
+    while True:
+        head = file.read(_RECORD.size)
+        if len(head) < _RECORD.size:
+            raise _TornError
+        opcode, length = _RECORD.unpack(head)
+        if length > size:
+            raise McapError(f"a record at offset {at} claims {length} bytes")
+        if length > size - at - _RECORD.size:
+            raise _TornError
+        try:
+            if opcode in _LOADED:
+                budget.unpack(length)
+                content = file.read(length)
+                if opcode == Opcode.DATA_END:
+                    _check_data_end(content, checksum)
+                elif opcode == Opcode.CHUNK:
+                    yield from _iterate_chunk(_unpack_chunk(content, budget), budget)
+                else:
+                    yield from _parse_record(opcode, content)
+                checksum = zlib.crc32(content, zlib.crc32(head, checksum))
+            else:
+                checksum = _pass_over(file, length, zlib.crc32(head, checksum))
+        except ExcessError as error:
+            raise ExcessError(f"offset {at}: a record {error}") from error
+        at += _RECORD.size + length
+        if opcode == Opcode.FOOTER:
+            if len(end := file.read(len(MAGIC))) < len(MAGIC):
+                raise _TornError
+            if end != MAGIC:
+                raise InvalidMagic(end)
+            return
+
+
+def _pass_over(file: BinaryIO, length: int, checksum: int) -> int:
+    """Read a record that is not used, block by block; return the checksum with it."""
+    while length > 0:
+        block = file.read(min(length, _BLOCK_BYTES))
+        if not block:
+            raise _TornError
+        checksum, length = zlib.crc32(block, checksum), length - len(block)
+    return checksum
+
+
+def _check_data_end(content: bytes, checksum: int) -> None:
+    stored = DataEnd.read(ReadDataStream(BytesIO(content))).data_section_crc
+    if stored not in (0, checksum):
+        raise McapError(f"the checksum of its data is {checksum}, not {stored}")
+
+
+def _unpack_chunk(content: bytes, budget: ReadBudget) -> bytes:
+    """Return the records of a chunk, of no more bytes than it says."""
+    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+    data: bytes = chunk.data
+    size = chunk.uncompressed_size
+    budget.unpack(size)
+    if chunk.compression == "zstd":
+        # Not in one call: that allocates what the frame says, which may be anything.
+        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as frames:
+            data = frames.read(size + 1)
+    elif chunk.compression == "lz4":
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = decompressor.decompress(data, max_length=size + 1)
+        if not decompressor.eof and len(data) <= size:
+            raise McapError("a chunk is cut")
+    elif chunk.compression:
+        raise UnsupportedCompressionError(chunk.compression)
+    if len(data) > size:
+        raise McapError(f"a chunk unpacks to more than its {size} bytes")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise McapError("a chunk has a wrong checksum")
+    return data
+
+
+def _iterate_chunk(content: bytes, budget: ReadBudget) -> Iterator[Schema | Channel | _Message]:
+    at, size = 0, len(content)
+    while at < size:
+        budget.take_record()
+        opcode, length = _RECORD.unpack_from(content, at)
+        begin, at = at + _RECORD.size, at + _RECORD.size + length
+        if at > size:
+            raise McapError("a record goes on beyond the end of its chunk")
+        if opcode in _LOADED:
+            yield from _parse_record(opcode, content[begin:at])
+
+
+def _parse_record(opcode: int, content: bytes) -> Iterator[Schema | Channel | _Message]:
+    """Yield the record if it is a schema, channel or message."""
+    if opcode == Opcode.MESSAGE:
+        channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(content)
+        yield _Message(channel_id, log_ns or publish_ns, content[_MESSAGE.size :])
+    elif opcode == Opcode.SCHEMA:
+        yield Schema.read(ReadDataStream(BytesIO(content)))
+    elif opcode == Opcode.CHANNEL:
+        yield Channel.read(ReadDataStream(BytesIO(content)))
 
 
 def _check_names(path: Path, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> None:

@@ -1,15 +1,19 @@
 """Reader of a recording's files: whole chunks, and where a file is damaged.
 
 Nothing of a chunk is used before its checksum was right. After damage the search goes on byte by
-byte for the next whole chunk, since a flipped length would lead astray.
+byte for the next whole chunk, since a flipped length would lead astray. A budget bounds that search, and what chunks
+unpack to.
 """
 
 from __future__ import annotations
 
 import mmap
+import re
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -18,9 +22,10 @@ from typing import NamedTuple, TypeVar
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Schema
+from mcap.records import Channel, Schema, Statistics
 from zstandard import ZstdDecompressor, ZstdError, get_frame_parameters
 
+from logs.recording.budget import ExcessError, ReadBudget
 from logs.recording.disk import MAGIC, describe_kind_error, find_later_segments
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.segment import CHUNK, CHUNK_FIELDS, COMPRESSION, INDEX, MESSAGE, STORED_SIZE, ZERO_UTC
@@ -74,7 +79,8 @@ class ReadingOrder:
 class Contents:
     """Reader of the messages in chunks; remembers the schemas seen so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, budget: ReadBudget) -> None:
+        self._budget = budget
         self._schemas: dict[int, Schema] = {}
         self._definitions: dict[bytes, tuple[int, Definition, int]] = {}
 
@@ -86,16 +92,28 @@ class Contents:
 
         Raises:
             RecordingError: a message is missing that the order wants.
+            _BadRecordError: there is something else than whole records in it; what came before is good.
+            ExcessError: there are too many.
         """
+        try:
+            yield from self._messages(content, offset, order)
+        except (McapError, LookupError, ValueError, struct.error) as error:  # it was written so
+            raise _BadRecordError("is no chunk of a recording, though its checksum is right") from error
+
+    def _messages(self, content: bytes, offset: int, order: ReadingOrder | None) -> Iterator[RecordedMessage]:
         channels: dict[int, tuple[Definition, int]] = {}
         at = 0
         size = len(content)
+        take_record = self._budget.take_record
         while at < size:
+            take_record()
             if content[at] != _IS_MESSAGE:
                 at = self._define(content, at, channels)
                 continue
             _, length, channel, sequence, at_ns, _ = MESSAGE.unpack_from(content, at)
             begin, at = at + MESSAGE.size, at + _RECORD.size + length
+            if at > size:
+                raise _BadRecordError("has a message that goes on beyond its end")
             definition, zero_utc_ns = channels[channel]
             if order is not None:
                 if sequence != order.following and order.following is not None:
@@ -149,8 +167,11 @@ _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of 
 _DATA_END = struct.Struct("<BQI")
 _CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
 _ATTACHMENT_FIELDS = 36  # bytes besides name, type and data
+_TIMES_BYTES = 16  # at the begin of an attachment
+_TEXT_LENGTH, _CHECKSUM = struct.Struct("<I"), struct.Struct("<I")
 _DECOMPRESSOR = ZstdDecompressor()
-_MOST_CHUNK_BYTES = 2**28  # a policy library is the largest message, some ten million bytes
+# A chunk by its head: opcode, numbers, and the name of the compression; fixed in length, so it is searched in one pass.
+_CHUNK_HEAD = re.compile(b"%c.{36}(?:\0{4}|\4\0{3}%s)" % (Opcode.CHUNK, COMPRESSION), re.DOTALL)
 _IS_INDEX = int(Opcode.MESSAGE_INDEX)  # a plain number: compared for every record
 
 
@@ -193,6 +214,8 @@ class _TornRecordError(_BadRecordError):
     """A record goes on beyond the end of the file."""
 
 
+_UNUSABLE = (_BadRecordError, ExcessError)
+
 Buffer = bytes | mmap.mmap
 Scanned = RecordedMessage | AttachedFile | Damage | EndOfFile
 
@@ -206,13 +229,27 @@ def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
     Raises:
         RecordingError: the file cannot be read, is no recording at all, or lacks a message that the order wants.
     """
+    with _mapped(path) as data:
+        if data:
+            yield from _scan(path, data, order)
+        else:  # ended between creating and first writing
+            yield EndOfFile(finished=False, complete=False)
+
+
+@contextmanager
+def _mapped(path: Path) -> Iterator[Buffer]:
+    """Give the bytes of a file, read where they are looked at.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
     try:
         with path.open("rb") as file:
-            if path.stat().st_size == 0:  # ended between creating and first writing
-                yield EndOfFile(finished=False, complete=False)
+            if path.stat().st_size == 0:
+                yield b""
                 return
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                yield from _scan(path, data, order)
+                yield data
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
 
@@ -226,32 +263,76 @@ def last_chunk(path: Path) -> list[RecordedMessage] | None:
     Raises:
         RecordingError: the file cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            if path.stat().st_size == 0:
-                return None
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                end = _data_end(data)
-                return None if end is None else _last_chunk(data, end + _DATA_END.size)
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
+    with _mapped(path) as data:
+        end = _data_end(data)
+        return None if end is None else _last_chunk(data, end + _DATA_END.size)
 
 
 def _last_chunk(data: Buffer, at: int) -> list[RecordedMessage]:
     """Return the messages of the last chunk by the summary at `at`, whose checksum is right."""
     offset = length = 0
-    while data[at] != Opcode.FOOTER:
-        if data[at] == Opcode.CHUNK_INDEX:
-            *_, offset, length = _CHUNK_INDEX.unpack_from(data, at)
-        at += _RECORD.size + _RECORD.unpack_from(data, at)[1]
     try:
-        return list(Contents().messages(_chunk(data, offset, length), offset)) if length else []
-    except _BadRecordError:
+        for opcode, begin, _ in _summary_records(data, at):
+            if opcode == Opcode.CHUNK_INDEX:
+                *_, offset, length = _CHUNK_INDEX.unpack_from(data, begin - _RECORD.size)
+        if not length or _whole(data, offset) != length:
+            return []
+        budget = ReadBudget(len(data))
+        return list(Contents(budget).messages(_chunk(data, offset, length, budget), offset))
+    except (*_UNUSABLE, struct.error):  # the summary was written so
         return []
 
 
+def count_by_topic(path: Path) -> dict[str, int] | None:
+    """Return the number of messages of each topic in a file, by the statistics in its summary.
+
+    Returns:
+        None if the file does not end with a summary that is whole and has statistics.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    with _mapped(path) as data:
+        end = _data_end(data)
+        try:
+            return None if end is None else _count_by_topic(data, end + _DATA_END.size)
+        except (_BadRecordError, McapError, ValueError, struct.error):  # the summary was written so
+            return None
+
+
+def _count_by_topic(data: Buffer, at: int) -> dict[str, int] | None:
+    topics: dict[int, str] = {}
+    counts: dict[int, int] | None = None
+    for opcode, begin, end in _summary_records(data, at):
+        if opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(data[begin:end])))
+            topics[channel.id] = channel.topic
+        elif opcode == Opcode.STATISTICS:
+            counts = Statistics.read(ReadDataStream(BytesIO(data[begin:end]))).channel_message_counts
+    if counts is None:
+        return None
+    of_topics: Counter[str] = Counter()
+    for channel, number in counts.items():
+        of_topics[topics.get(channel, "")] += number
+    return of_topics
+
+
+def _summary_records(data: Buffer, at: int) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, begin and end of the content of each record of a summary, without the footer."""
+    while True:
+        if at + _RECORD.size > len(data):
+            raise _TornRecordError("is torn")
+        opcode, length = _RECORD.unpack_from(data, at)
+        if opcode == Opcode.FOOTER:
+            return
+        begin, at = at + _RECORD.size, at + _RECORD.size + length
+        if at > len(data):
+            raise _TornRecordError("is torn")
+        yield opcode, begin, at
+
+
 def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scanned]:
-    size = len(data)
+    size, budget = len(data), ReadBudget(len(data))
     at = len(MAGIC)
     damaged = False
     if data[:at] != MAGIC:
@@ -259,20 +340,20 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
             yield Damage(path, 0, size, "torn in the first bytes", torn=True)
             yield EndOfFile(finished=False, complete=False)
             return
-        first = _next_chunk(data, 0)
+        first = _next_chunk(data, 0, budget)
         if first is None:
             raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){describe_kind_error(path)}")
         yield Damage(path, 0, first, "damaged before the first whole chunk")
         at, damaged = first, True
-    contents = Contents()
+    contents = Contents(budget)
     while at < size:
         opcode = data[at]
         try:
             length = _whole(data, at)
             if opcode == Opcode.CHUNK:
-                yield from contents.messages(_chunk(data, at, length), at, order)
+                yield from contents.messages(_chunk(data, at, length, budget), at, order)
             if opcode == Opcode.ATTACHMENT:
-                yield _attached(data, at, length)
+                yield _attached(data, at, length, budget)
             if opcode == Opcode.DATA_END:
                 stored = _DATA_END.unpack_from(data, at)[2]
                 if not damaged and stored != _crc(data, at):
@@ -283,10 +364,12 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
                 yield EndOfFile(finished=finished, complete=True)
                 return
             at += length
-        except _BadRecordError as error:
-            later = _next_chunk(data, at + 1)
+        except _UNUSABLE as error:
+            later = _next_chunk(data, at + 1, budget)
             if later is None:
                 later = _data_end(data)
+            if later is not None and later < at:
+                later = None  # the footer points back, to bytes that were read
             if later == at:
                 yield Damage(path, at, 0, "no record is lost, but the end of the data is damaged")
                 yield EndOfFile(finished=False, complete=True)
@@ -325,16 +408,30 @@ def _whole(data: Buffer, at: int) -> int:
     return int(_RECORD.size + length)
 
 
-def _attached(data: Buffer, at: int, length: int) -> AttachedFile:
-    """Return the attachment at `at`, if its checksum is right."""
-    content = data[at + _RECORD.size : at + length]
-    if zlib.crc32(content[:-4]) != struct.unpack("<I", content[-4:])[0]:
+def _attached(data: Buffer, at: int, length: int, budget: ReadBudget) -> AttachedFile:
+    """Return the attachment at `at`, if its checksum is right; its data are not copied."""
+    budget.look(length)
+    end = at + length - _CHECKSUM.size
+    if _crc(data, end, at + _RECORD.size) != _CHECKSUM.unpack_from(data, end)[0]:
         raise _BadRecordError("has a wrong checksum")
+    name, begin = _text(data, at + _RECORD.size + _TIMES_BYTES, end)
+    media_type, begin = _text(data, begin, end)
+    data_bytes = end - begin - STORED_SIZE.size
+    if data_bytes < 0 or data_bytes != STORED_SIZE.unpack_from(data, begin)[0]:
+        raise _BadRecordError("is no attachment")
+    return AttachedFile(name, media_type, data_bytes)
+
+
+def _text(data: Buffer, at: int, end: int) -> tuple[str, int]:
+    """Return the text at `at` in a record that ends at `end`, and the offset after it."""
+    begin = at + _TEXT_LENGTH.size
+    if begin > end or begin + _TEXT_LENGTH.unpack_from(data, at)[0] > end:
+        raise _BadRecordError("is no attachment")
+    later = begin + _TEXT_LENGTH.unpack_from(data, at)[0]
     try:
-        attachment = Attachment.read(ReadDataStream(BytesIO(content)))
-    except (McapError, struct.error, ValueError) as error:  # it was written so
+        return data[begin:later].decode("utf-8"), later
+    except UnicodeDecodeError as error:
         raise _BadRecordError("is no attachment") from error
-    return AttachedFile(attachment.name, attachment.media_type, len(attachment.data))
 
 
 def _pair_length(data: Buffer, inner: int, length: int) -> int:
@@ -347,16 +444,23 @@ def _pair_length(data: Buffer, inner: int, length: int) -> int:
     return int(8 + first + struct.unpack_from("<I", data, inner + 4 + first)[0])
 
 
-def _chunk(data: Buffer, at: int, length: int) -> bytes:
-    """Return the content of the chunk at `at`, if its checksum is right."""
+def _chunk(data: Buffer, at: int, length: int, budget: ReadBudget) -> bytes:
+    """Return the content of the chunk at `at`, if its checksum is right.
+
+    Raises:
+        _BadRecordError: it is not, or the chunk is damaged otherwise.
+        ExcessError: it asks for more than the budget has.
+    """
     _, _, first, last, size, crc, name_length = CHUNK.unpack_from(data, at)
     name_at = at + CHUNK.size
     begin = name_at + name_length + STORED_SIZE.size
-    if name_length not in (0, len(COMPRESSION)) or begin > at + length or first > last or size > _MOST_CHUNK_BYTES:
+    if name_length not in (0, len(COMPRESSION)) or begin > at + length or first > last:
         raise _BadRecordError("has a damaged head")
     name, (stored,) = data[name_at : name_at + name_length], STORED_SIZE.unpack_from(data, name_at + name_length)
     if stored != at + length - begin or (size != stored and not name) or name not in (b"", COMPRESSION):
         raise _BadRecordError("has a damaged head (or a compression that no recording of uavctl has)")
+    budget.look(length)
+    budget.unpack(size)
     content = data[begin : at + length]
     if name:
         try:
@@ -369,14 +473,14 @@ def _chunk(data: Buffer, at: int, length: int) -> bytes:
     return content
 
 
-def _next_chunk(data: Buffer, start: int) -> int | None:
+def _next_chunk(data: Buffer, start: int, budget: ReadBudget) -> int | None:
     """Return the offset of the next whole chunk from `start` on."""
-    at = data.find(bytes([Opcode.CHUNK]), start)
-    while 0 <= at <= len(data) - CHUNK.size:
+    while (head := _CHUNK_HEAD.search(data, start)) is not None:
+        at = head.start()
         try:
-            _chunk(data, at, _whole(data, at))
-        except _BadRecordError:
-            at = data.find(bytes([Opcode.CHUNK]), at + 1)
+            _chunk(data, at, _whole(data, at), budget)
+        except _UNUSABLE:
+            start = at + 1
         else:
             return at
     return None
@@ -394,10 +498,10 @@ def _data_end(data: Buffer) -> int | None:
     return int(end) if _summary_ok(data, start) else None
 
 
-def _crc(data: Buffer, end: int) -> int:
-    """Return the CRC-32 of everything before `end`."""
-    with memoryview(data) as view:
-        return zlib.crc32(view[:end])
+def _crc(data: Buffer, end: int, begin: int = 0) -> int:
+    """Return the CRC-32 of everything from `begin` to before `end`, which are not copied."""
+    with memoryview(data) as view, view[begin:end] as part:
+        return zlib.crc32(part)
 
 
 def _summary_ok(data: Buffer, start: int) -> bool:
@@ -406,13 +510,15 @@ def _summary_ok(data: Buffer, start: int) -> bool:
     if at < start or data[at + _FOOTER.size :] != MAGIC:
         return False
     opcode, length, summary_start, _, crc = _FOOTER.unpack_from(data, at)
-    covered = data[start : at + _FOOTER.size - 4]
-    return bool(opcode == Opcode.FOOTER and length == 20 and summary_start == start and crc == zlib.crc32(covered))
+    is_footer = opcode == Opcode.FOOTER and length == 20 and summary_start == start
+    return bool(is_footer and crc == _crc(data, at + _FOOTER.size - _CHECKSUM.size, start))
 
 
 def _is_torn(data: Buffer) -> bool:
     """Return whether a file without a good summary was cut short: it has neither footer nor magic at its end."""
     at = len(data) - len(MAGIC) - _FOOTER.size
+    if at < 0:
+        return True
     return data[at + _FOOTER.size :] != MAGIC and _RECORD.unpack_from(data, at) != (Opcode.FOOTER, 20)
 
 

@@ -109,6 +109,7 @@ def recover(src: Path, dst: Path) -> RecoverResult:
 def _copy(src: Path, file: DiskFile) -> RecoverResult:
     tally, parameters = _Tally(), ParameterReader()
     segment: Segment | None = None
+    has_header = False
     at_ns = zero_utc_ns = 0
     for item in walk(src):
         if isinstance(item, Damage):
@@ -129,7 +130,8 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
                 if topic in (HEADER, PARAMETER) or parse_raw_topic(topic) is not None:
                     record = decode(topic, item.data, item.at_ns)
                     parameters.take(record)
-                    if isinstance(record, Header):
+                    if isinstance(record, Header) and not has_header:
+                        has_header = True
                         utc_ns = at_ns + zero_utc_ns
                         segment.attach(
                             (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
@@ -20,6 +19,7 @@ from logs.recording.flight import FLOWN, FlightData
 from uavctl.account import make_ending, report_lost_records
 from uavctl.arrays import Array
 from uavctl.cause import CAUSES, Cause
+from uavctl.config.load import parse_stored_toml
 from uavctl.config.mission import FenceConfig
 from uavctl.number_text import format_duration, format_number, format_percent_above
 from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector
@@ -121,9 +121,9 @@ def compute_box(flight: FlightData, t_s: Array) -> tuple[Array, Array]:
 def _read_fences(flight: FlightData) -> Iterator[FenceConfig]:
     """Return the fences of the flight's configuration; none if it cannot be read any more."""
     try:
-        fences = tomllib.loads(flight.header.config_toml).get("fence", [])
+        fences = parse_stored_toml(flight.header.config_toml, "configuration").get("fence", [])
         yield from msgspec.convert(fences, tuple[FenceConfig, ...])
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError):
+    except (ConfigError, msgspec.ValidationError):
         return
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import re
 import struct
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -15,12 +14,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from logs.recording.budget import read_whole
 from logs.recording.disk import describe_kind_error, refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.export import Watch, count_messages, ignore_progress
 from logs.recording.reader import RecordedMessage, good_messages, header
 from logs.recording.summary import count
 from logs.recording.topics import parse_raw_topic
-from uavctl.errors import RecordingError, UsageError
+from uavctl.config.load import parse_stored_toml
+from uavctl.errors import ConfigError, RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
 from uavctl.mavlink.framing import is_frame
@@ -171,10 +172,7 @@ def read_tlog(path: Path) -> Tlog:
     Raises:
         RecordingError: The file cannot be read, holds no packet, its packets have no stamps, or stamps without a time.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
+    data = bytes(read_whole(path))
     cutter = _Cutter(data, _STAMP)
     note: tuple[str, ...] = ()
     if 2 * cutter.skipped_bytes > len(data) or not cutter.packets:
@@ -435,8 +433,8 @@ def find_utc_of_zero(flight: Path, first: Header) -> int:
 def _find_streams(first: Header) -> frozenset[str]:
     """Return the connections that carry a stream of bytes, by the configuration that was flown."""
     try:
-        urls = tomllib.loads(first.config_toml).get("daemon", {})
-    except tomllib.TOMLDecodeError:
+        urls = parse_stored_toml(first.config_toml, "configuration").get("daemon", {})
+    except ConfigError:
         return frozenset()
     return frozenset(name for name, url in urls.items() if isinstance(url, str) and url.startswith(STREAM_SCHEMES))
 

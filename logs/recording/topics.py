@@ -310,7 +310,7 @@ def decode(topic: str, data: bytes, at_ns: int) -> Record:
         return complete_record(_decode_fields(data, get_record_type(topic)))
     except KeyError as error:
         raise RecordingError(f"topic {topic} is not known to this version") from error
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise RecordingError(f"topic {topic}, log time {at_ns} ns: {error}") from error
 
 

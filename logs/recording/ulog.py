@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from logs.recording import mavlink_flight as neutral
+from logs.recording.budget import ExcessError, read_whole
 from logs.recording.disk import ULOG_MAGIC, FileKind, describe_kind_error, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
@@ -41,6 +42,10 @@ _LEAST_BYTES = {"D": 2, "L": 9, "C": 11, "A": 4, "R": 2, "O": 2, "P": 1, "Q": 2,
 _KNOWN_TYPES = frozenset(map(ord, (*_LEAST_BYTES, "F", "S", "B")))
 _LONGEST = 10_000  # of a message of a type that is not known; beyond, it is damage
 _MOST_READ = 20  # times that a damaged file is read over: one that is whole is read once
+# Of memory for all fields of all topics, spelled out: formats within formats may claim billions. A log of PX4 has
+# some ten thousand fields with names of thirty characters.
+_MAX_FIELD_BYTES = 2**25
+_FIELD_BYTES = 256  # of memory for a field, besides its name
 _SYNC = ord("S")  # a type of message whose content no reader looks at
 _FLAGS_BYTES = 40
 _ARMED = 2  # of vehicle_status.arming_state
@@ -65,10 +70,7 @@ def read_ulog(path: Path) -> MavlinkFlight:
         ExtraMissingError: pyulog is not there.
         RecordingError: The file cannot be read, is no ULog, or holds no message.
     """
-    try:
-        data = bytearray(path.read_bytes())
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
+    data = read_whole(path)
     if not data.startswith(ULOG_MAGIC):
         raise RecordingError(f"{path}: does not begin as a ULog does; is it a .ulg of PX4?{describe_kind_error(path)}")
     if len(data) < _HEAD_BYTES:
@@ -86,9 +88,30 @@ def _parse(path: Path, data: bytearray) -> Any:
 
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings, among our documents
-            return ULog(_BoundedFile(data))
+            return _make_bounded(ULog)(_BoundedFile(data))
+    except ExcessError as error:
+        raise RecordingError(f"{path}: {error}; it is damaged, or of no vehicle: fetch it again") from error
     except (ULogException, ArithmeticError, LookupError, RecursionError, TypeError, ValueError, struct.error) as error:
         raise RecordingError(f"{path}: damaged, or a ULog that pyulog cannot read ({error})") from error
+
+
+def _make_bounded(base: Any) -> Any:
+    """Return a reader of pyulog that refuses more fields than any log has, before it makes them."""
+    left_bytes = _MAX_FIELD_BYTES
+
+    class Subscription(base._MessageAddLogged):  # type: ignore[misc]
+        """A topic that is logged: here pyulog spells out its fields."""
+
+        def _parse_nested_type(self, prefix_str: str, type_name: str, message_formats: Any) -> None:
+            nonlocal left_bytes
+            left_bytes -= _FIELD_BYTES
+            for _, array_size, field_name in message_formats[type_name].fields:
+                left_bytes -= max(array_size, 1) * (_FIELD_BYTES + len(prefix_str) + len(field_name))
+            if left_bytes < 0:
+                raise ExcessError("its formats have far more fields than any log")
+            super()._parse_nested_type(prefix_str, type_name, message_formats)
+
+    return type("BoundedUlog", (base,), {"_MessageAddLogged": Subscription})
 
 
 class _BoundedFile(io.BytesIO):
@@ -226,7 +249,9 @@ class _Reader:
         return max(0, int(at_us) - self._origin_us) * 1e-6
 
     def _seconds(self, fields: dict[str, Any]) -> Array:
-        return np.asarray((fields["timestamp"].astype(np.int64) - self._origin_us) * 1e-6, dtype=np.float64)
+        # Stamps of 64 bits without a sign; their differences have one.
+        since_us = (fields["timestamp"].astype(np.uint64) - np.uint64(self._origin_us)).view(np.int64)
+        return np.asarray(since_us * 1e-6, dtype=np.float64)
 
     def _read_own_positions(self) -> tuple[str, list[tuple[int, Any, Any]]]:
         """Return the name and the points of its own position: in local NED, else on the globe."""

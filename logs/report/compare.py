@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -22,8 +21,8 @@ from logs.recording.reader import RecordedMessage, good_messages, read
 from logs.recording.replay import leaves
 from logs.recording.summary import FlightSummary, Percentiles, compute_position_errors_m, summarise
 from logs.recording.topics import HEADER, LIBRARY, RECORDER, decode, parse_raw_topic
-from uavctl.config.load import flatten_keys
-from uavctl.errors import RecordingError
+from uavctl.config.load import flatten_keys, parse_stored_toml
+from uavctl.errors import ConfigError, RecordingError
 from uavctl.mavlink.framing import scan_frames
 from uavctl.records import Header
 
@@ -305,8 +304,8 @@ def _collect_parameters(recording: LoadedFlight) -> dict[str, object]:
     """Return what a flight was set up with: configuration, design, library, versions, processor."""
     header: Header = recording.flight.header
     try:
-        config = tomllib.loads(header.config_toml)
-    except tomllib.TOMLDecodeError as error:
+        config = parse_stored_toml(header.config_toml, "configuration")
+    except ConfigError as error:
         raise RecordingError(
             f"{recording.identity.recording}: the configuration in its header is damaged ({error})"
         ) from error

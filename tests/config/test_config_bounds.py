@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
 import msgspec
 import pytest
 from config_mutants import CONFIG, Case, Mutants, find_ranges, load_bases
+from hypothesis import given
+from hypothesis import strategies as st
+from work_rig import limit_memory
 
 from uavctl.cli.app import run
-from uavctl.config import Config, dump_config, load, load_config, parse
+from uavctl.config import Config, document, dump_config, link, load, load_config, mission, parse
 from uavctl.config.document import (
     MAX_BYTES,
     MAX_DEPTH,
@@ -22,9 +26,11 @@ from uavctl.config.document import (
     MAX_VALUES,
     DataFileError,
     find_excess,
+    find_key_lines,
     read_text,
 )
 from uavctl.config.link import MAX_TRACE_PACKETS
+from uavctl.config.load import parse_stored_toml
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.errors import ConfigError
 from uavctl.lab.campaign.spec import read_campaign
@@ -327,3 +333,64 @@ def test_input_limits_that_leave_zero_out_are_refused(
         assert run(["design", "--config", preset, "--json", "--set", f"sets.{key}={moved}"]) == 2
         error = json.loads(capsys.readouterr().out)
         assert "sets.input_" in error["message"]
+
+
+# --- time and memory -------------------------------------------------------------------------------------------------
+
+QUOTED = st.text(alphabet="\"'\\\n#[a.= ", max_size=60)
+
+
+@pytest.mark.fault(33)
+def test_a_parser_never_sees_a_key_of_many_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(text: str) -> None:
+        raise AssertionError(f"{len(text)} characters went to the parser")
+
+    monkeypatch.setattr("tomllib.loads", refuse)
+    for key in ("x." * 10_000 + "a", "'x'." * 10_000 + "a", "x . " * 10_000 + "a"):
+        for text in (f"\n{key} = 1\n", f"\n[{key}]\n", f"\na = {{{key} = 1}}\n"):
+            assert told(text) == (f"my.toml:2: a dotted key is nested more than {MAX_DEPTH} deep; mend the file",)
+
+
+@pytest.mark.fault(33)
+def test_parts_of_dotted_keys_are_counted() -> None:
+    numbers = "a = 1.5\n" * (MAX_VALUES // 2)
+    assert find_excess(numbers) is None
+    lines = MAX_VALUES // 5 + 2
+    excess = find_excess(numbers + "[a.b.c.d.e]\n" * lines)
+    assert excess is not None and MAX_VALUES // 2 < excess[0] <= MAX_VALUES // 2 + lines
+
+
+@given(QUOTED)
+def test_no_quote_is_looked_at_twice(text: str) -> None:
+    # A pattern that fails at a quote has gone on to the end of the text, and begins again at the next one.
+    for at, letter in enumerate(text):
+        if letter in "\"'":
+            assert document._MARK.match(text, at) is not None
+
+
+@given(st.text(alphabet="[]()a ,", max_size=60))
+def test_no_cell_of_a_header_is_looked_at_twice(text: str) -> None:
+    for at, letter in enumerate(text):
+        if letter not in ", ":
+            assert mission._HEADER_CELL.match(text, at) is not None
+
+
+@pytest.mark.parametrize("read", [link._read_delays, mission._read_rows])
+def test_rows_beyond_all_bounds_are_not_taken_apart(read: Callable[[Path], object], tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text("1" + ",1" * 20 + "\n" + ("1" + ",1" * 20 + "\n") * 60_000, encoding="utf-8")
+    with limit_memory(8 * path.stat().st_size), pytest.raises(DataFileError, match="has 60001 "):
+        read(path)
+
+
+def test_a_long_table_name_is_not_kept_for_each_of_its_keys() -> None:
+    text = f"[{'k' * 20_000}]\n" + "".join(f"a{i} = 1\n" for i in range(1000))
+    with limit_memory(100 * len(text)):
+        find_key_lines(text)
+
+
+def test_the_configuration_in_a_recording_has_the_same_bounds() -> None:
+    for text in ("x." * 10_000 + "a = 1", "a = " + "[" * 5000 + "]" * 5000, f"a = '{'x' * 5000}'", "a = " + "1" * 5000):
+        with pytest.raises(ConfigError, match=r"^header"):
+            parse_stored_toml(text, "header")
+    assert parse_stored_toml(PAPER, "header")["name"]

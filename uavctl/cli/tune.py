@@ -42,6 +42,7 @@ from uavctl.cli.flying import check_take_off
 from uavctl.cli.identify import find_design_warnings, show_fit_progress
 from uavctl.cli.tune_flights import TuneEnd, TuneFlight, find_complete_flight, fly_once, measure_position
 from uavctl.config import Config
+from uavctl.config.document import DataFileError, read_text
 from uavctl.config.load import dump_config, parse_recorded, parse_toml
 from uavctl.errors import RecordingError, UsageError
 from uavctl.lab.identify.history import read_recorded_history
@@ -216,7 +217,11 @@ def _chooses_plant(common: Common) -> bool:
     path = Path(common.config)
     if path.suffix != ".toml" or not path.exists():
         return False
-    sim = parse_toml(path.read_text(encoding="utf-8"), str(path)).get("sim")
+    try:
+        text = read_text(path)
+    except DataFileError:
+        return False  # the loader says what is wrong
+    sim = parse_toml(text, str(path)).get("sim")
     return isinstance(sim, dict) and "plant" in sim
 
 

@@ -38,25 +38,47 @@ MAX_KEY_LENGTH, MAX_TEXT_LENGTH, MAX_LIST_LENGTH = 100, 1000, 20_000
 MAX_INTEGER = 2**63 - 1
 _MAX_REPORTED = 5  # places reported one by one
 
-# Strings and comments, in which brackets mean nothing, or a bracket.
-_BRACKET = re.compile(
-    r'''\#[^\n]*|"""(?:\\.|[^\\])*?"{3,5}|\'\'\'.*?\'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|(?P<open>[\[{])|(?P<close>[\]}])''',
-    re.DOTALL,
+_MAX_PATH_LENGTH = MAX_DEPTH * (MAX_KEY_LENGTH + 1)  # of a key path that has a line [characters]
+
+# Strings and comments, in which marks mean nothing, or a mark. A string without its end goes on to the end of its line
+# or of the text: a pattern that fails there would begin again at every later quote, and take quadratic time.
+_MARK = re.compile(
+    r'''
+    \#[^\n]* | """(?:\\.|[^\\])*?(?:"{3,5}|\\?\Z) | \'\'\'.*?(?:'{3,5}|\Z) | "(?:\\.|[^"\\\n])*"? | '[^'\n]*'?
+  | (?P<open>[\[{])
+  | (?P<close>[\]}])
+  | (?P<dot>\.)
+  | (?P<border>[=,\n])
+    ''',
+    re.VERBOSE | re.DOTALL,
 )
 
 
 def find_excess(text: str) -> tuple[int, str] | None:
-    """Line and reason, if a TOML text is too long, has too many values, or nests too deep to be read."""
+    """Line and reason, if a TOML text is too long, has too many values, or nests too deep to be read.
+
+    Each dot in a key nests as a bracket does: the time that a parser takes grows with the square of their number.
+    """
     if len(text) > MAX_BYTES:
         return 1, f"is longer than {MAX_BYTES} characters"
-    if text.count(",") + text.count("\n") > MAX_VALUES:
+    values = text.count(",") + text.count("\n")
+    if values > MAX_VALUES:
         return 1, f"has more than {MAX_VALUES} lines and commas"
-    depth = 0
-    for match in _BRACKET.finditer(text):
+    depth = dots = 0
+    for match in _MARK.finditer(text):
         depth += (match.lastgroup == "open") - (match.lastgroup == "close")
-        if depth > MAX_DEPTH:
+        if match.lastgroup == "dot":
+            dots += 1
+            values += dots > 1  # each is a table; a number has one dot at most
+        elif match.lastgroup is not None:  # between strings the same key goes on
+            dots = 0
+        if depth > MAX_DEPTH or dots >= MAX_DEPTH or values > MAX_VALUES:
             line = text.count("\n", 0, match.start()) + 1
-            return line, f"brackets are nested more than {MAX_DEPTH} deep, or not closed"
+            if depth > MAX_DEPTH:
+                return line, f"brackets are nested more than {MAX_DEPTH} deep, or not closed"
+            if values > MAX_VALUES:
+                return line, f"has more than {MAX_VALUES} lines, commas and parts of dotted keys up to here"
+            return line, f"a dotted key is nested more than {MAX_DEPTH} deep"
     return None
 
 
@@ -247,7 +269,8 @@ class _Scanner:
         while True:
             token, line = self._tokens[self._index]
             part = token[1:-1] if token[0] in "\"'" else token
-            path = f"{path}.{part}" if path else part
+            # A longer path is refused; kept whole for each of its keys, it would fill the memory.
+            path = (f"{path}.{part}" if path else part)[:_MAX_PATH_LENGTH]
             first_line = self.lines.setdefault(path, line)
             is_known = path in self._known
             self._known.add(path)

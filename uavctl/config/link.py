@@ -171,8 +171,10 @@ def read_trace_file(link: LinkConfig, folder: Path, problems: list[ConfigProblem
 
 def _read_delays(path: Path) -> Floats:
     """Delay of each packet [s], infinite for a lost one."""
-    rows = [(number, line.split(",")) for number, line in enumerate(read_lines(path), 1)]
-    rows = [(number, cells) for number, cells in rows if not cells[0].lstrip().startswith("#")]
+    lines = [(number, line) for number, line in enumerate(read_lines(path), 1) if not line.lstrip().startswith("#")]
+    if len(lines) > MAX_TRACE_PACKETS + 1:  # more, also if the first one names the columns
+        raise DataFileError((f"{path}: has {len(lines)} packets, more than {MAX_TRACE_PACKETS}",))
+    rows = [(number, line.split(",")) for number, line in lines]
     column, width, factor = 0, 1, 1.0
     if rows and any(cell.strip() for cell in rows[0][1]) and not any(_is_number(cell) for cell in rows[0][1]):
         number, cells = rows[0]

@@ -377,6 +377,19 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         raise ConfigError((f"{file}:1: TOML: {error}; mend the number",)) from error
 
 
+def parse_stored_toml(text: str, file: str) -> dict[str, Any]:
+    """The table of a TOML text that a recording holds; a value that no key takes is refused.
+
+    Raises:
+        ConfigError: It is damaged.
+    """
+    table = parse_toml(text, file)
+    problems = tuple(f"{file}: {problem.key}: {problem.reason}; {problem.todo}" for problem in find_oversized(table))
+    if problems:
+        raise ConfigError(problems)
+    return table
+
+
 def _override(table: dict[str, Any], text: str, problems: list[str]) -> tuple[str, str] | None:
     """Write one override into the table; its key path and text, or None if it is no override."""
     path, equals, value = text.partition("=")

@@ -150,19 +150,26 @@ def read_trajectory_file(
     return msgspec.structs.replace(mission, trajectory=samples), places
 
 
+# A cell of a header, without separators outside of brackets. A bracket without its end goes on to the end of the line:
+# a pattern that fails there would begin again at every later bracket, and take quadratic time.
+_HEADER_CELL = re.compile(r"(?:[^,\s\[(]|[\[(][^\])]*[\])]?)+")
+
+
 def _read_rows(path: Path) -> list[tuple[int, Floats]]:
     """Line number and values of each row, as t, x, y, z and vx, vy, vz in s, m and m/s, all of the same width."""
-    rows: list[tuple[int, list[str]]] = []
+    lines: list[tuple[int, str]] = []
     for number, line in enumerate(read_lines(path), 1):
         text = line.strip()
         if text.startswith("#"):  # a comment, or a header in one
-            cells = re.split(r"[,\s]+(?![^\[(]*[\])])", text.lstrip("# ").strip())
-            if rows or len(cells) < _POSITION_COLUMNS or not all(parse_heading(cell) for cell in cells):
+            cells = _HEADER_CELL.findall(text.lstrip("# "))
+            if lines or len(cells) < _POSITION_COLUMNS or not all(parse_heading(cell) for cell in cells):
                 continue
             text = ",".join(cells)
         if text:
-            rows.append((number, text.split(",")))
-    columns, rows = _read_columns(path, rows)
+            lines.append((number, text))
+    if len(lines) > MAX_TRAJECTORY_SAMPLES + 1:  # more, also if the first one names the columns
+        raise DataFileError((f"{path}: has {len(lines)} rows, more than {MAX_TRAJECTORY_SAMPLES}",))
+    columns, rows = _read_columns(path, [(number, text.split(",")) for number, text in lines])
     if not rows:
         raise DataFileError((f"{path}: has no rows",))
     if len(rows) > MAX_TRAJECTORY_SAMPLES:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from record_values import values
+from recording_fakes import HEADER
 
 from logs.recording.topics import MATRICES, TOPICS, EncodingError, Topic, are_identical, decode, encode, round_plan
 from uavctl.errors import RecordingError
@@ -178,6 +179,10 @@ def test_what_cannot_be_written_is_refused(value: object) -> None:
         ("/uavctl/setpoint", b'{"at_ns":1,"accel_mps2":["NaN",0],"source":"hold"}'),
         ("/uavctl/setpoint", b'{"at_ns":1,"accel_mps2":["NaN",0,"1.0"],"source":"hold"}'),
         ("/uavctl/setpoint", b'{"at_ns":"NaN","accel_mps2":[0,0,0],"source":"hold"}'),
+        (
+            "/uavctl/header",
+            encode(HEADER).replace(b'"design":{', b'"design":{"deep":' + b"[" * 10_000 + b"]" * 10_000 + b","),
+        ),
     ],
 )
 def test_foreign_bytes_are_refused(topic: str, data: bytes) -> None:

@@ -186,3 +186,16 @@ def test_without_pyulog_the_extra_is_named(path: Path, monkeypatch: pytest.Monke
         read_ulog(path)
     assert (refused.value.package, refused.value.extra) == ("pyulog", "ulog")
     assert run(["log", "report", str(path)]) == 2
+
+
+def test_stamps_of_the_last_bit_are_times_as_others(tmp_path: Path) -> None:
+    begin_us = 2**63 + 5
+    writer = UlogWriter(begin_us)
+    topic = writer.topic(
+        "vehicle_local_position", ["float x", "float y", "float z", "float vx", "float vy", "float vz"]
+    )
+    for index in range(5):
+        writer.data(topic, begin_us + index * 100_000, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
+    path = tmp_path / "last.ulg"
+    path.write_bytes(writer.file)
+    assert read_ulog(path).height_t_s.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])

@@ -1,0 +1,62 @@
+"""Limits of work that are counted, never timed: bytes that a checksum runs over, and calls of functions."""
+
+from __future__ import annotations
+
+import sys
+import tracemalloc
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from unittest.mock import patch
+
+
+class TooMuchWorkError(BaseException):
+    """More work than the limit; no reader takes it for damage."""
+
+
+@contextmanager
+def limit_checksums(limit_bytes: int) -> Iterator[None]:
+    """Fail once more bytes have gone through CRC-32; every chunk does so, packed and unpacked."""
+    crc32, left_bytes = zlib.crc32, limit_bytes
+
+    def count(data: bytes | memoryview, value: int = 0) -> int:
+        nonlocal left_bytes
+        left_bytes -= len(data)
+        if left_bytes < 0:
+            raise TooMuchWorkError(f"more than {limit_bytes} bytes looked at")
+        return crc32(data, value)
+
+    with patch("zlib.crc32", count):
+        yield
+
+
+@contextmanager
+def limit_calls(limit: int) -> Iterator[None]:
+    """Fail once more functions of Python have been called."""
+    left, former = limit, sys.getprofile()
+
+    def count(_frame: FrameType, event: str, _argument: object) -> None:
+        nonlocal left
+        left -= event == "call"
+        if left < 0:
+            sys.setprofile(former)
+            raise TooMuchWorkError(f"more than {limit} calls")
+
+    sys.setprofile(count)
+    try:
+        yield
+    finally:
+        sys.setprofile(former)
+
+
+@contextmanager
+def limit_memory(limit_bytes: int) -> Iterator[None]:
+    """Fail if the peak of the memory that Python allocates is higher."""
+    tracemalloc.start()
+    try:
+        yield
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes <= limit_bytes
