@@ -37,11 +37,11 @@ from uavctl.cli.flying import (
     order_stand_by,
     print_ending,
     record_failure,
-    stop_on_signals,
     wait_for_server,
 )
 from uavctl.cli.live_line import show_live_line
 from uavctl.cli.services import enable_realtime_process, run_services
+from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import LoadedConfig
 from uavctl.config.connections import find_security_warnings

@@ -42,9 +42,9 @@ from uavctl.cli.flying import (
     open_viewers,
     print_ending,
     record_failure,
-    stop_on_signals,
 )
 from uavctl.cli.live_line import show_live_line
+from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
