@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -109,24 +109,33 @@ class Scene:
     @property
     def has_landed(self) -> bool:
         """Whether it has been landing; once disarmed, a PX4 takes up the mode of before."""
-        return any(truth.mode == "AUTO.LAND" for truth in self.truths)
+        return any(truth.mode in ("AUTO.LAND", "LAND") for truth in self.truths)
 
     def wait_for_flight(self, seconds: float) -> None:
         """Let some of the vehicle's own time go by."""
         end_ns = self.truths[-1].at_ns + round(seconds * 1e9)
         wait_until(lambda: self.truths[-1].at_ns >= end_ns, f"{seconds:g} s on board")
 
-    def fly(self, out: str, *options: str, environ: dict[str, str] | None = None) -> subprocess.Popen[str]:
+    def fly(
+        self,
+        out: str,
+        *options: str,
+        environ: dict[str, str] | None = None,
+        stderr: int | None = subprocess.PIPE,
+        preexec_fn: Callable[[], object] | None = None,
+        json: bool = True,
+    ) -> subprocess.Popen[str]:
         """The daemon, ready to fly or already over."""
         urls = ["--vehicle", self.vehicle, "--mocap", self.mocap]
         patience = [argument for setting in PATIENT_DAEMON for argument in ("--set", setting)]
-        command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, "--json"]
+        command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, *(["--json"] if json else [])]
         places = ["--out", str(self.folder / out), "--control", str(self.control)]
         return subprocess.Popen(
             [*command, *places, *options],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=stderr,
             text=True,
+            preexec_fn=preexec_fn,
             env=without_pages(environ or os.environ),
         )
 

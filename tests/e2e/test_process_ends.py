@@ -1,0 +1,134 @@
+"""Ends of a flight's process: signals, a console that is closed or that nobody reads; judged on the true vehicle."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from operation_rig import Scene, end_process, open_scene
+from patience import LIMIT_S, wait_until
+
+from uavctl.cli.app import run
+
+AUTOPILOTS = ("px4", "ardupilot")
+CLOSED = b"\x89MCAP0\r\n"
+
+
+@pytest.fixture
+def air(request: pytest.FixtureRequest) -> Iterator[Scene]:
+    with open_scene(f'sim.autopilot="{request.param}"') as result:
+        yield result
+
+
+def wait_for_flight(air: Scene) -> None:
+    """Until the daemon tracks."""
+    wait_until(lambda: air.ctl("status")[0] == 0 and air.status()["mode"] == "track", "the daemon tracks")
+
+
+def check_end(air: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    """The vehicle lands, the recording is closed, and it replays identically."""
+    wait_until(lambda: air.has_landed, "the vehicle lands")
+    path = air.folder / "f" / "flight.mcap"
+    assert path.read_bytes().endswith(CLOSED)
+    capsys.readouterr()
+    assert run(["log", "replay", str(path)]) == 0
+
+
+def read_answer(output: str) -> dict[str, Any]:
+    """The one document of a flight on standard output."""
+    document: dict[str, Any] = json.loads(output)
+    return document
+
+
+@pytest.mark.slow
+@pytest.mark.fault(86)
+@pytest.mark.parametrize(
+    ("air", "name"),
+    [*((autopilot, name) for autopilot in AUTOPILOTS for name in ("SIGHUP", "SIGUSR1")), ("px4", "SIGQUIT")],
+    indirect=["air"],
+)
+def test_a_signal_that_would_kill_ends_the_flight_in_order(
+    air: Scene, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with end_process(air.fly("f")) as process:
+        wait_for_flight(air)
+        process.send_signal(signal.Signals[name])
+        process.send_signal(signal.SIGHUP)  # a closed terminal's comes twice, and cuts nothing short
+        output, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0
+    assert read_answer(output)["ending"]["as_ordered"]
+    check_end(air, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.fault(86)
+@pytest.mark.parametrize("air", ["px4"], indirect=True)
+def test_a_second_deliberate_signal_ends_the_process(air: Scene) -> None:
+    with end_process(air.fly("f", "--set", "fallback.brake_s=600", "--set", "fallback.hold_s=600")) as process:
+        wait_for_flight(air)
+        process.send_signal(signal.SIGTERM)
+        wait_until(lambda: air.status()["mode"] != "track", "the end begins")
+        process.send_signal(signal.SIGQUIT)
+        process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 128 + signal.SIGQUIT
+    assert (air.folder / "f" / "flight.mcap").read_bytes().endswith(CLOSED)
+
+
+@pytest.mark.slow
+@pytest.mark.fault(89)
+@pytest.mark.parametrize("air", AUTOPILOTS, indirect=True)
+def test_a_full_pipe_that_nobody_reads_holds_up_neither_flight_nor_end(
+    air: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with pytest.raises(BlockingIOError):
+        while True:
+            os.write(writer, b"x" * 4096)
+    os.set_blocking(writer, True)
+    with end_process(air.fly("f", stderr=writer)) as process:
+        os.close(writer)
+        wait_for_flight(air)
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout is not None
+        output = process.stdout.read()
+        process.wait(LIMIT_S)
+    os.close(reader)
+    assert process.returncode == 0
+    assert read_answer(output)["ending"]["as_ordered"]
+    check_end(air, capsys)
+
+
+def close_stderr() -> None:
+    os.close(2)
+
+
+@pytest.mark.slow
+@pytest.mark.fault(90)
+@pytest.mark.parametrize("air", AUTOPILOTS, indirect=True)
+def test_a_flight_without_standard_error_is_flown_and_answered(air: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    with end_process(air.fly("f", stderr=None, preexec_fn=close_stderr)) as process:
+        wait_for_flight(air)
+        process.send_signal(signal.SIGTERM)
+        output, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0
+    assert read_answer(output)["ending"]["as_ordered"]
+    check_end(air, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.fault(90)
+@pytest.mark.parametrize("air", ["px4"], indirect=True)
+def test_a_summary_is_written_in_whatever_encoding(air: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    environ = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    with end_process(air.fly("f", environ=environ, json=False)) as process:
+        wait_for_flight(air)
+        process.send_signal(signal.SIGTERM)
+        output, errors = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0 and output.isascii() and output
+    assert "Traceback" not in errors
+    check_end(air, capsys)
