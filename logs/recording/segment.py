@@ -364,6 +364,7 @@ def _library() -> str:
 # as well as possible and once the disk takes it; what the failed chunk held goes to the next file.
 
 
+MAX_TAKEN_NAMES = 100  # that somebody else has taken, passed over at a time
 RETRY_S = 1.0  # between tries to begin a file after a failed write
 
 
@@ -478,15 +479,14 @@ class Rotation:
         self._retry_s = self._clock()
 
     def begin(self, write_note: Callable[[str], object]) -> None:
-        """Open the next file; a later one than the first repeats the header.
+        """Open the next file, under the next free name; a later one than the first repeats the header.
 
         Raises:
             OSError: it cannot be opened or written.
         """
-        path = make_segment_path(self._path, self.number)
-        path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
-        self._segment = Segment(self._open_file(path), self._log.chunk_bytes, self.zero_utc_ns)
-        self._opened = path.stat()
+        self._path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
+        self._segment = Segment(self._open_next(), self._log.chunk_bytes, self.zero_utc_ns)
+        self._opened = make_segment_path(self._path, self.number).stat()
         self._preface = 0
         if self.number > 1:
             self._preface = 1 + bool(self._header)
@@ -494,6 +494,15 @@ class Rotation:
                 self.write(HEADER, self.at_ns, self._header)
             write_note(self.because)
             self._segment.attach(self._attachments)
+
+    def _open_next(self) -> OutputFile:
+        """Open a file under the next name that nobody has taken."""
+        for _ in range(MAX_TAKEN_NAMES):
+            try:
+                return self._open_file(make_segment_path(self._path, self.number))
+            except FileExistsError:
+                self.number += 1
+        return self._open_file(make_segment_path(self._path, self.number))
 
     def write(self, topic: str, at_ns: int, data: bytes) -> None:
         """Add a message to the open file.

@@ -94,9 +94,7 @@ def test_a_full_pipe_that_nobody_reads_holds_up_neither_flight_nor_end(
         os.close(writer)
         wait_for_flight(air)
         process.send_signal(signal.SIGTERM)
-        assert process.stdout is not None
-        output = process.stdout.read()
-        process.wait(LIMIT_S)
+        output, _ = process.communicate(timeout=LIMIT_S)
     os.close(reader)
     assert process.returncode == 0
     assert read_answer(output)["ending"]["as_ordered"]
@@ -131,4 +129,24 @@ def test_a_summary_is_written_in_whatever_encoding(air: Scene, capsys: pytest.Ca
         output, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 0 and output.isascii() and output
     assert "Traceback" not in errors
+    check_end(air, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.fault(93)
+@pytest.mark.parametrize("air", AUTOPILOTS, indirect=True)
+def test_a_later_file_s_name_that_somebody_takes_in_flight_loses_no_record(
+    air: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with end_process(air.fly("f", "--set", "log.segment_bytes=1048576")) as process:
+        wait_for_flight(air)
+        foreign = air.folder / "f" / "flight-2.mcap"
+        foreign.write_text("somebody's own")
+        wait_until((air.folder / "f" / "flight-3.mcap").exists, "the recording goes on under the next free name")
+        process.send_signal(signal.SIGTERM)
+        output, _ = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0
+    answer = read_answer(output)
+    assert answer["ending"]["as_ordered"] and answer["recorder_dropped"] == 0
+    assert foreign.read_text() == "somebody's own"
     check_end(air, capsys)
