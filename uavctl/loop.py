@@ -75,6 +75,7 @@ CONSOLE_CODES = frozenset(
         EventCode.CONTROLLER_FAULT,
         EventCode.HUNG_UP,
         EventCode.CONNECTION_SILENT,
+        EventCode.PROCESS_ENDED,
         EventCode.NO_HEARTBEAT,
         EventCode.STAMP_UNIT,
     }
