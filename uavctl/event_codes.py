@@ -85,5 +85,7 @@ class EventCode(StrEnum):
     # Relay of positions to the vehicle
     RELAY_SILENT = "relay-silent"
     RELAY_RESUMED = "relay-resumed"
+    # Errors that do not end the flight
+    INTERNAL_ERROR = "internal-error"
     # Recorder
     RECORDING = "recording"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -149,4 +151,58 @@ def test_a_later_file_s_name_that_somebody_takes_in_flight_loses_no_record(
     answer = read_answer(output)
     assert answer["ending"]["as_ordered"] and answer["recorder_dropped"] == 0
     assert foreign.read_text() == "somebody's own"
+    check_end(air, capsys)
+
+
+def find_free_descriptor(pid: int) -> int:
+    """The number that the next opened file of a process gets."""
+    taken = {int(path.name) for path in Path(f"/proc/{pid}/fd").iterdir()}
+    return next(number for number in range(len(taken) + 1) if number not in taken)
+
+
+@pytest.mark.slow
+@pytest.mark.fault(87)
+@pytest.mark.parametrize("air", AUTOPILOTS, indirect=True)
+def test_a_new_port_of_the_vehicle_without_a_descriptor_left_does_not_end_the_flight(
+    air: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with end_process(air.fly("f")) as process:
+        wait_for_flight(air)
+        _, hard = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
+        resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (find_free_descriptor(process.pid), hard))
+        air.tap.change_port()
+        air.wait_for_flight(5.0)
+        assert air.mode in ("OFFBOARD", "GUIDED")
+        process.send_signal(signal.SIGTERM)
+        output, _ = process.communicate(timeout=LIMIT_S)
+    answer = read_answer(output)
+    assert answer["ending"]["as_ordered"], answer["ending"]
+    check_end(air, capsys)
+
+
+FAILING = """
+import os, select, threading
+plain = select.select
+def failing(*arguments):
+    if threading.current_thread() is threading.main_thread() and os.path.exists({flag!r}):
+        raise MemoryError
+    return plain(*arguments)
+select.select = failing
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.fault(88)
+@pytest.mark.usefixtures("control_may_fail")
+@pytest.mark.parametrize("air", AUTOPILOTS, indirect=True)
+def test_a_main_loop_that_works_no_more_asks_for_landing_and_closes_the_recording(
+    air: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flag = air.folder / "fails"
+    (air.folder / "sitecustomize.py").write_text(FAILING.format(flag=str(flag)))
+    with end_process(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
+        wait_for_flight(air)
+        flag.touch()
+        _, errors = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1 and "MemoryError" in errors
     check_end(air, capsys)

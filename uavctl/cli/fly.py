@@ -181,11 +181,11 @@ def fly_daemon(
                         stopped,
                         duration_s=duration_s,
                         stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
+                        engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
                         after_tick=(
                             feed.after_tick,
                             lambda *_: vehicle_lock.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
-                            lambda ticked, _: engagement.handle_tick(loop, ticked),
                             *service_functions,
                             *garbage_functions,
                         ),

@@ -185,7 +185,10 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
         UavctlError: The page cannot be written; the recording is unchanged.
     """
     command = [sys.executable, "-P", "-m", "logs.report.flight_page", str(path), str(page)]
-    process = subprocess.run(command, input=pickle.dumps(summary), capture_output=True, check=False)
+    try:
+        process = subprocess.run(command, input=pickle.dumps(summary), capture_output=True, check=False)
+    except OSError as error:  # no memory, or no descriptor left
+        raise UavctlError(f"{page}: {error.strerror}; `uavctl log report {path}` draws the page later") from error
     if process.returncode:
         error_lines = process.stderr.decode(errors="replace").strip().splitlines()
         reason = error_lines[-1] if error_lines else f"its process ended with {process.returncode}"

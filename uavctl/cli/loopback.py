@@ -188,12 +188,8 @@ def _fly_real_time(prepared: Prepared, path: Path, engagement: Engagement, viewe
                     stopped,
                     duration_s=config.duration_s,
                     stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
-                    after_tick=(
-                        feed.after_tick,
-                        lambda *_: recorder.catch_up(),
-                        lambda ticked, _: engagement.handle_tick(loop, ticked),
-                        collector.after_tick,
-                    ),
+                    engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
+                    after_tick=(feed.after_tick, lambda *_: recorder.catch_up(), collector.after_tick),
                     on_events=feed.events.extend,
                 )
             wall_s = time.perf_counter() - begin_s
