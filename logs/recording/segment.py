@@ -510,8 +510,13 @@ class Rotation:
         Raises:
             OSError: a chunk could not be written; `fail` keeps what it held, this message included.
         """
-        self.written += 1
-        self._open_segment().add(QueuedMessage(get_definition(topic), self.written, at_ns, data))
+        segment = self._open_segment()
+        entry = QueuedMessage(get_definition(topic), self.written + 1, at_ns, data)
+        try:
+            segment.add(entry)
+        finally:
+            if segment.open_entries and segment.open_entries[-1] is entry:  # else it is lost, and takes no number
+                self.written += 1
 
     def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
         """Add a record's message; the header is kept for later files.
@@ -576,10 +581,10 @@ class Rotation:
         segment.finish()
         self._retire(segment, there=self._is_present(segment))
 
-    def fail(self, error: OSError) -> None:
+    def fail(self, error: Exception) -> None:
         """Handle a failed write: keep the messages of the open chunk, and close the file as well as possible."""
         self.failures += 1
-        self.reason = str(error)
+        self.reason = str(error) or type(error).__name__
         self.because = f"after a failed write: {self.reason}"
         self._retry_s = self._clock() + RETRY_S
         segment = self._segment
