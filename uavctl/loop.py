@@ -401,7 +401,7 @@ class ControlLoop:
 
     def note_error(self, subject: str, error: Exception, at_ns: int) -> Event:
         """Note an error of what the flight does not need; return the event."""
-        text = f"{subject}: {_describe_error(error)}"
+        text = f"{subject}: {_describe_error(error)}; the flight goes on"
         return self.handle_failure(Failure(at_ns=at_ns, text=text, effect=FailureEffect.NONE), to_nobody)
 
     def send_landing_request(self, at_ns: int, send: Send) -> bool:
