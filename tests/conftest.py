@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,6 +72,13 @@ def _failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
     if "control_may_fail" not in request.fixturenames:
         monkeypatch.setattr("uavctl.loop.ControlLoop._fail", fail)
         monkeypatch.setattr("uavctl.loop.ControlLoop._make_error_event", fail)
+
+
+@pytest.fixture(autouse=True)
+def _no_alarm_is_left() -> Iterator[None]:
+    """A second signal limits the time to the end of the process, and the test's process goes on."""
+    yield
+    signal.alarm(0)
 
 
 @pytest.fixture

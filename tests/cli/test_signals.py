@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 
 import pytest
 
@@ -15,15 +14,6 @@ KILLING = [
     *(signal.Signals[f"SIG{name}"] for name in NAMES),
     *(number for number in signal.valid_signals() if number >= signal.SIGRTMIN),
 ]
-
-
-@pytest.fixture
-def alarms() -> Iterator[None]:
-    """End with no alarm set, and the handler of before."""
-    handler = signal.getsignal(signal.SIGALRM)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, handler)
 
 
 @pytest.mark.fault(86)
@@ -41,7 +31,7 @@ def test_each_signal_that_would_kill_asks_for_the_end(number: int) -> None:
 
 @pytest.mark.fault(86)
 @pytest.mark.parametrize("number", sorted(DELIBERATE))
-def test_a_second_deliberate_signal_ends_the_command_and_sets_a_limit_for_that(number: int, alarms: None) -> None:
+def test_a_second_deliberate_signal_ends_the_command_and_sets_a_limit_for_that(number: int) -> None:
     with pytest.raises(EndedBySignal) as raised, stop_on_signals():
         signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGHUP)
