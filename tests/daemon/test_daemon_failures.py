@@ -170,8 +170,11 @@ def test_88_where_no_tick_works_any_more_landing_is_asked_for_until_it_is_answer
             plain(data)
 
     monkeypatch.setattr(vehicle, "send", send)
+    served_ns: list[int] = []
+    rig.services.append(lambda *_: served_ns.append(rig.now_ns))
     with pytest.raises((MemoryError, UavctlError)):
         rig.fly()
+    assert served_ns[-1] >= list_landing_requests(rig)[-1]  # a service manager would end a silent process
     rig.wait({}, rig.now_ns + SECOND)
     assert has_landed(rig, autopilot)
     assert len(list_landing_requests(rig)) >= 3

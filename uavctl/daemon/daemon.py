@@ -16,6 +16,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 
+from msgspec.structs import replace
+
 from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
 from uavctl.clock import Ticker, monotonic_ns
@@ -117,6 +119,7 @@ class _Flight:
         self._is_over = False
         self._withheld = 0  # messages to the vehicle in this cycle
         self._failed_cycles = 0  # in a row
+        self._ticked: Ticked | None = None  # the last tick
         self._engagement_error: Exception | None = None
         self._reported_subjects: set[str] = set()
         self._reserve = bytearray(RESERVE_BYTES)
@@ -139,15 +142,18 @@ class _Flight:
                 self._failed_cycles = 0
         if self._engagement_error is not None:
             raise self._engagement_error
-        return self._stop_ns is not None and self._engagement_error is None
+        return self._stop_ns is not None
 
     def request_landing(self) -> None:
-        """Send the landing request of a flight whose cycles have failed, until it is answered."""
+        """Send the landing request of a flight whose cycles have failed, until it is answered. Services go on."""
         connection = self._connections[VEHICLE]
+        quiet_tick = None if self._ticked is None else replace(self._ticked, answers=(), news=(), notices=())
         while not connection.closed and self._loop.send_landing_request(
             self._now(), lambda message: connection.send(message.data)
         ):
             self._attempt_pause()
+            if quiet_tick is not None:
+                self._run_services(self.services, quiet_tick, 0)
             try:
                 for data, _ in connection.receive():
                     self._loop.receive_landing_answer(data)
@@ -189,7 +195,11 @@ class _Flight:
         )
         if loop.outside and ticked.decision.solve is not None:
             loop.answered(ticked.step_ns)
-        for number, service in enumerate((*bookkeeping, *self.services)):
+        self._run_services((*bookkeeping, *self.services), ticked, lateness_ns)
+        self._ticked = ticked
+
+    def _run_services(self, services: Sequence[AfterTick], ticked: Ticked, lateness_ns: int) -> None:
+        for number, service in enumerate(services):
             try:
                 service(ticked, lateness_ns)
             except Exception as error:  # noqa: BLE001 not needed for flying
