@@ -218,9 +218,10 @@ def serve_in_child(
 ) -> None:
     """Run `serve` in a child process: `Ready` and every `Truth` go into the pipe.
 
-    Ctrl-C is left to the parent, which sets `stop`; the child also ends when its parent is gone.
+    Signals of the terminal are left to the parent, which sets `stop`; the child also ends when its parent is gone.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     parent = parent_process()
     try:
         serve(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,19 +63,27 @@ def _no_waiting_for_the_disk() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What fails in the controller fails the test too, though in flight the positions for the vehicle go on."""
+    """What fails in a flight fails the test too, though the flight itself goes on or ends in order."""
 
-    def fail(loop: object, error: Exception, at_ns: int) -> None:
-        raise error
+    def fail(loop: object, text: str, at_ns: int) -> None:
+        raise sys.exc_info()[1] or AssertionError(text)
 
     # By its name: the process that hands the tests out, and runs none, would load all that flies.
     if "control_may_fail" not in request.fixturenames:
-        monkeypatch.setattr("uavctl.loop.ControlLoop._report_control_failure", fail)
+        monkeypatch.setattr("uavctl.loop.ControlLoop._fail", fail)
+        monkeypatch.setattr("uavctl.loop.ControlLoop._make_error_event", fail)
+
+
+@pytest.fixture(autouse=True)
+def _no_alarm_is_left() -> Iterator[None]:
+    """A second signal limits the time to the end of the process, and the test's process goes on."""
+    yield
+    signal.alarm(0)
 
 
 @pytest.fixture
 def control_may_fail() -> None:
-    """For tests of what happens when the controller fails."""
+    """For tests of what happens when the controller, or what is beside it, fails."""
 
 
 @pytest.fixture(autouse=True)

@@ -71,6 +71,7 @@ class EventCode(StrEnum):
     # Connections [connection]
     HUNG_UP = "hung-up"  # the other side has closed a TCP connection
     CONNECTION_SILENT = "went-silent"  # nothing came over a TCP connection any more
+    PROCESS_ENDED = "process-ended"  # the process that listens to cameras has ended
     CLOCK_RESYNC = "clock-resync"
     STAMP_UNIT = "stamp-unit"
     SLOW_ANSWER = "timesync"  # answers to TIMESYNC were too slow to be used
@@ -84,5 +85,7 @@ class EventCode(StrEnum):
     # Relay of positions to the vehicle
     RELAY_SILENT = "relay-silent"
     RELAY_RESUMED = "relay-resumed"
+    # Errors that do not end the flight
+    INTERNAL_ERROR = "internal-error"
     # Recorder
     RECORDING = "recording"

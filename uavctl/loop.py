@@ -5,7 +5,8 @@ measurements and decisions go to the sink, in their order.
 
 One tick: 1. gather and record the inputs; 2. send what is due on the connections; 3. run the core (`flight.tick`);
 4. relay positions to the vehicle; 5. update the hand-over; 6. send a setpoint or a request, and answer orders.
-A core that fails is not run again: no setpoint is sent from then on, and the vehicle is asked to land.
+A core that fails is not run again: no setpoint is sent from then on, and the vehicle is asked to land. If the hand-over
+fails, or whole ticks do, a landing request of its own is sent until it is answered.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
 from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
+from uavctl.mavlink.landing import LandingRequest
 from uavctl.mavlink.messages import CommandAck, Message, StatusText
 from uavctl.mavlink.relay import Relay
 from uavctl.records import (
@@ -38,6 +40,8 @@ from uavctl.records import (
     Decision,
     Ending,
     Event,
+    Failure,
+    FailureEffect,
     InertialSample,
     Order,
     Outgoing,
@@ -54,6 +58,7 @@ from uavctl.records import (
     Timing,
     VehicleMotion,
     VehicleStatus,
+    discard,
     moves_now,
     raw_topic,
 )
@@ -75,8 +80,10 @@ CONSOLE_CODES = frozenset(
         EventCode.CONTROLLER_FAULT,
         EventCode.HUNG_UP,
         EventCode.CONNECTION_SILENT,
+        EventCode.PROCESS_ENDED,
         EventCode.NO_HEARTBEAT,
         EventCode.STAMP_UNIT,
+        EventCode.INTERNAL_ERROR,
     }
 )  # codes of events that the console shows
 FROZEN_TEXT = "the camera repeats its position although the vehicle moves; its positions count as lost"
@@ -142,7 +149,10 @@ class ControlLoop:
         # Last time at which positions contradicted the vehicle's climb or landing; None before.
         self._frozen_ns: int | None = None  # the last tick with frozen positions
         self._position_inconsistent_ns: int | None = None
-        self._is_handover_failed = False  # not even the hand-over works any more: positions are all that is sent
+        # Not even the hand-over works any more: positions and a landing request are all that is sent.
+        self._is_handover_failed = False
+        self._is_landing_due = False  # control has failed, and the hand-over has not been told yet
+        self._landing_request = LandingRequest((config.daemon.system_id, config.daemon.component_id), config.hand_over)
         self._last_setpoint_ns: int | None = None  # the last setpoint that flew the vehicle
         self._lands_on_failure = config.fallback.land or config.relay.enabled
         self.account = FlightAccount()
@@ -168,7 +178,9 @@ class ControlLoop:
     def finished(self) -> bool:
         """Whether the vehicle has been handed over and nothing more will be sent."""
         if self._is_handover_failed:
-            return not self._hand_over.is_relay_needed
+            return not (self._hand_over.is_relay_needed or self._landing_request.is_pending)
+        if self._is_landing_due:
+            return False
         is_core_over = self._decision is not None and self._decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
         return self._hand_over.is_finished or (is_core_over and not self._hand_over.is_busy)
 
@@ -228,6 +240,16 @@ class ControlLoop:
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Receive one datagram that arrived at `at_ns`; ticks before that time use none of its positions."""
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
+        try:
+            return self._handle_data(link, data, at_ns)
+        except Exception as error:  # noqa: BLE001 one datagram ends no flight; a link that is not heard does in order
+            event = self._make_error_event(f"link {link}: a datagram: {_describe_error(error)}", at_ns)
+            return Received((), False, False, (event,))
+
+    def _handle_data(self, link: str, data: bytes, at_ns: int) -> Received:
+        """Pass the messages of a datagram on to the next tick; return replies and events."""
+        if link == VEHICLE:
+            self._landing_request.receive(data)
         from_vehicle = from_source = False
         console_events: tuple[Event, ...] = ()
         received = self._links[link].receive(data, at_ns)
@@ -332,17 +354,20 @@ class ControlLoop:
         """Update the hand-over and send what it allows; return each order with its answer."""
         if self._is_handover_failed:
             self._hand_over.update_airborne(inputs.at_ns, self._vehicle)
+            self._send_landing_request(inputs.at_ns, send)
             return ()
         answers: tuple[tuple[Command, Event], ...] = ()
         outgoing: list[Outgoing] = []  # what fails in `send` is no failure of the controller
         try:
             handover_output = self._hand_over.update(self._make_handover_input(inputs, output))
+            self._is_landing_due = False
             answers = tuple(self._match_answers(inputs.commands, output.events, handover_output.events))
             notices += self._record_handover(handover_output, inputs.at_ns)
             self._send_commands(handover_output, output, inputs.at_ns, outgoing.append)
         except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
             self._is_handover_failed = True
-            notices.append(self._report_control_failure(error, inputs.at_ns))
+            notices.append(self._fail(_describe_error(error), inputs.at_ns))
+            self._send_landing_request(inputs.at_ns, send)
         for datagram in outgoing:
             send(datagram)
         return answers
@@ -355,12 +380,10 @@ class ControlLoop:
                     self._state, inputs, self._controller, is_climbing_or_landing=self._hand_over.has_begun
                 )
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
-                notices.append(self._report_control_failure(error, inputs.at_ns))
-                return self._make_failed_output(
-                    inputs, land=self._lands_on_failure or self._hand_over.is_ordered_flight
-                )
-            return output
-        return self._make_failed_output(inputs, land=False)
+                notices.append(self._fail(_describe_error(error), inputs.at_ns))
+            else:
+                return output
+        return self._make_failed_output(inputs, land=self._is_landing_due)
 
     def _make_failed_output(self, inputs: StepInput, *, land: bool) -> TickOutput:
         """Make the output of a tick after the core has failed: no setpoint; `land` asks the vehicle to land."""
@@ -384,11 +407,38 @@ class ControlLoop:
         )
         return TickOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
-    def _report_control_failure(self, error: Exception, at_ns: int) -> Event:
-        """Note that the controller has failed, and return its event: no setpoint is sent; the relay goes on."""
-        last = next(reversed(extract_tb(error.__traceback__)), None)
-        where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
-        self.account.control_error = self.account.control_error or f"{in_words(error)}{where}"
+    def fail(self, error: Exception, at_ns: int) -> Event:
+        """Note an error of a whole cycle, and return its event: no setpoint is sent, landing is asked for."""
+        return self.handle_failure(
+            Failure(at_ns=at_ns, text=_describe_error(error), effect=FailureEffect.CONTROL), discard
+        )
+
+    def note_error(self, subject: str, error: Exception, at_ns: int) -> Event:
+        """Note an error of what the flight does not need; return the event."""
+        text = f"{subject}: {_describe_error(error)}; the flight goes on"
+        return self.handle_failure(Failure(at_ns=at_ns, text=text, effect=FailureEffect.NONE), discard)
+
+    def send_landing_request(self, at_ns: int, send: Send) -> bool:
+        """Send the landing request of a flight whose cycles fail, if it is due; return whether it is pending."""
+        self._begin_landing_request(at_ns)
+        if self._landing_request.is_due(at_ns):
+            text = "no cycle works any more: landing is asked for"
+            self.handle_failure(Failure(at_ns=at_ns, text=text, effect=FailureEffect.LANDING), send)
+        return self._landing_request.is_pending
+
+    def handle_failure(self, failure: Failure, send: Send) -> Event:
+        """Handle an error outside the loop; return its event."""
+        self._put("/uavctl/failure", failure.at_ns, failure)
+        if failure.effect is FailureEffect.CONTROL:
+            return self._fail(failure.text, failure.at_ns)
+        event = self._make_error_event(failure.text, failure.at_ns)
+        if failure.effect is FailureEffect.LANDING:
+            self._send_landing_request(failure.at_ns, send)
+        return event
+
+    def _fail(self, text: str, at_ns: int) -> Event:
+        self._is_landing_due = self._lands_on_failure or self._hand_over.is_ordered_flight
+        self.account.control_error = self.account.control_error or text
         event = Event(
             at_ns=at_ns,
             severity=Severity.ERROR,
@@ -397,6 +447,24 @@ class ControlLoop:
         )
         self._put("/uavctl/event", at_ns, event)
         return event
+
+    def _make_error_event(self, text: str, at_ns: int) -> Event:
+        event = Event(at_ns=at_ns, severity=Severity.ERROR, code=EventCode.INTERNAL_ERROR, text=text)
+        self._put("/uavctl/event", at_ns, event)
+        return event
+
+    def _begin_landing_request(self, at_ns: int) -> None:
+        if self._hand_over.lands_on_request and (self._lands_on_failure or self._hand_over.is_ordered_flight):
+            self._landing_request.begin(at_ns)
+
+    def _send_landing_request(self, at_ns: int, send: Send) -> None:
+        self._begin_landing_request(at_ns)
+        for data in self._landing_request.due(at_ns):
+            send(self._record_outgoing(VEHICLE, data, at_ns))
+
+    def receive_landing_answer(self, data: bytes) -> None:
+        """Look for the answer to the landing request in a datagram of the vehicle's link."""
+        self._landing_request.receive(data)
 
     def order(self, command: Command) -> bool:
         """Queue an order of the operator for the next tick; False if too many wait already."""
@@ -490,6 +558,9 @@ class ControlLoop:
         # The newest status with the mode that it left for counts: it may have the reason of the change.
         left_statuses = [status for status in left_statuses if status.mode == left_statuses[0].mode]
         self._vehicle = next(iter((left_statuses or statuses)[::-1]), self._vehicle)
+        address = self._links[VEHICLE].vehicle
+        if self._vehicle is not None and address is not None:
+            self._landing_request.prepare(address, self._vehicle.autopilot)
         if statuses and self._messages_lost_ns is not None and statuses[-1].at_ns > self._messages_lost_ns:
             self._messages_lost_ns = None
         return _select_newest(samples), tuple(statuses), tuple(messages)
@@ -596,6 +667,13 @@ class ControlLoop:
             relay = self.relay
             if relay is not None:
                 self._put("/uavctl/relay", at_ns, relay)
+
+
+def _describe_error(error: Exception) -> str:
+    """Return an error in words, with its place in the code."""
+    last = next(reversed(extract_tb(error.__traceback__)), None)
+    where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
+    return f"{in_words(error)}{where}"
 
 
 def _select_newest(samples: list[PositionSample]) -> tuple[PositionSample, ...]:

@@ -291,6 +291,22 @@ class Refused(Record, frozen=True, kw_only=True):
     counts: dict[str, int]  # reason -> count
 
 
+class FailureEffect(StrEnum):
+    """Effect of an error on a flight."""
+
+    NONE = "none"  # the flight goes on
+    CONTROL = "control"  # no setpoint any more; the hand-over is to ask for landing
+    LANDING = "landing"  # a landing request is sent without the hand-over
+
+
+class Failure(Record, frozen=True, kw_only=True):
+    """Error outside the control loop, as the loop is told; an input, for a replay."""
+
+    at_ns: int
+    text: str
+    effect: FailureEffect
+
+
 class Checked(Record, frozen=True, kw_only=True):
     """One item of the check before arming; nothing that the loop decides, so a replay passes it over."""
 

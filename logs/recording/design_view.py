@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
+from uavctl.config.load import parse_stored_toml
 from uavctl.constraint_names import ConstraintNames, name_constraints
 from uavctl.errors import ConfigError, RecordingError
 from uavctl.records import Header, Matrix, Vec3, Vector

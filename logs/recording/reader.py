@@ -541,12 +541,20 @@ def segment_files(path: Path) -> tuple[Path, ...]:
         inside = sorted(existing_files.difference(*map(find_later_segments, existing_files)))[:3]
         hint = f"; give the recording in it: {', '.join(map(str, inside))}" if inside else " and holds no recording"
         raise RecordingError(f"{path}: is a folder{hint}")
-    files = tuple(file for file in find_later_segments(path) if _continues(file))
-    if path.exists():
-        files = (path, *files)
+    files = [path] if path.exists() else []
+    candidates = find_later_segments(path)
+    readable_files = [file for file in candidates if _has_message(file)]
+    for index, file in enumerate(candidates):
+        if file in readable_files:
+            is_part = _continues(file)
+        else:
+            following = next((later for later in candidates[index:] if later in readable_files), None)
+            is_part = not files or _lacks_messages(files[-1], following)
+        if is_part:
+            files.append(file)
     if not files:
         raise RecordingError(f"{path}: no such recording")
-    return files
+    return tuple(files)
 
 
 def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
@@ -662,6 +670,26 @@ def good_messages(path: Path) -> Iterator[RecordedMessage]:
                 yield item
         elif isinstance(item, Damage) and not item.torn:
             raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
+
+
+def _has_message(path: Path) -> bool:
+    """Return whether any message of a file can be read."""
+    try:
+        return any(isinstance(item, RecordedMessage) for item in scan(path))
+    except RecordingError:  # not a recording
+        return False
+
+
+def _lacks_messages(path: Path, following: Path | None) -> bool:
+    """Return whether messages may be missing between the end of a file and the next one, or the recording's end."""
+    end = last_chunk(path)
+    if not end:
+        return True
+    if following is None:
+        note = _note(end)
+        return note is None or not note.is_end
+    first = next((item for item in scan(following) if isinstance(item, RecordedMessage)), None)
+    return first is None or first.sequence != end[-1].sequence + 1
 
 
 def _continues(path: Path) -> bool:

@@ -69,13 +69,16 @@ class DerivedTopics:
 
     def derive_messages(self, topic: str, at_ns: int, record: Record, data: bytes) -> list[tuple[str, int, bytes]]:
         """Return topic, log time [ns] and message of all that is derived from a record, whose message is `data`."""
-        self._look(record)
         if isinstance(record, Header):
             self._zero_utc_ns = record.zero_utc_ns or 0
         messages = [(name, at_ns, view) for name, view in self._derive_views(at_ns, record)]
-        if self._watch is not None:
-            for name, time_ns, message in ((topic, at_ns, data), *messages):
-                self._watch(get_definition(name), time_ns + self._zero_utc_ns, message)
+        try:
+            self._look(record)
+            if self._watch is not None:
+                for name, time_ns, message in ((topic, at_ns, data), *messages):
+                    self._watch(get_definition(name), time_ns + self._zero_utc_ns, message)
+        except Exception as error:  # noqa: BLE001 who looks on ends no recording
+            self._note_unseen(record, error)
         return messages
 
     def _derive_views(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
@@ -83,10 +86,13 @@ class DerivedTopics:
             return []
         try:
             return self._views.derive(at_ns, record)
-        except (RecordingError, ValueError, TypeError, LookupError, ArithmeticError) as error:
-            self.unseen += 1
-            self.reason = f"{type(record).__name__}: {error}"
+        except Exception as error:  # noqa: BLE001 views are not needed to decide alike
+            self._note_unseen(record, error)
             return []
+
+    def _note_unseen(self, record: Record, error: Exception) -> None:
+        self.unseen += 1
+        self.reason = f"{type(record).__name__}: {error}"
 
 
 LOOK_S = 1.0  # between two syncs, and looks at the disk's room
@@ -207,6 +213,9 @@ class WriteQueue:
             if due:
                 self._written_s = self._clock()
         except OSError as error:
+            self._files.fail(error)
+        except Exception as error:  # noqa: BLE001 no memory, or a defect: the record at hand is lost
+            self.drop()
             self._files.fail(error)
 
     def finish(self) -> None:
@@ -455,7 +464,10 @@ class _Base:
         # that looks at little, takes no lock and wakes no thread.
         queue = self._queue
         if len(queue) < self._max_waiting:
-            queue.append((topic, at_ns, record))
+            try:
+                queue.append((topic, at_ns, record))
+            except MemoryError:
+                self._journal.drop()
         else:
             self._journal.drop()
 
@@ -519,9 +531,10 @@ class Recorder(_Base):
         while not self._stop.is_set():
             self._due.wait(POLL_S)
             self._due.clear()
-            journal.drain(
-                compute_batch_size(len(journal.queue), RECORDS), compute_batch_size(len(journal.views_due), VIEWS)
-            )
+            with suppress(Exception):  # no memory, say: the next round tries again
+                journal.drain(
+                    compute_batch_size(len(journal.queue), RECORDS), compute_batch_size(len(journal.views_due), VIEWS)
+                )
         journal.finish()
 
 

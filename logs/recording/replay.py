@@ -34,6 +34,7 @@ from uavctl.records import (
     Datagram,
     Decision,
     Event,
+    Failure,
     Plan,
     PositionSample,
     Record,
@@ -486,6 +487,8 @@ def replay(
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):
             loop.refused(record.link, record.counts, record.at_ns)
+        elif isinstance(record, Failure):
+            loop.handle_failure(record, discard)
         elif isinstance(record, RecorderNote):
             findings.dropped = record.dropped
         if _is_compared(topic):
@@ -523,6 +526,6 @@ def _is_input(topic: str) -> bool:
     """Return whether a topic is not compared: its records drive the loop, or the result reports them."""
     link = parse_raw_topic(topic)
     try:
-        return get_record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]
+        return get_record_type(topic) in (StepInput, Refused, Failure, RecorderNote) if link is None else not link[1]
     except KeyError:
         return True  # decoding says that nobody knows it

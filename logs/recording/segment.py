@@ -364,6 +364,7 @@ def _library() -> str:
 # as well as possible and once the disk takes it; what the failed chunk held goes to the next file.
 
 
+MAX_TAKEN_NAMES = 100  # that somebody else has taken, passed over at a time
 RETRY_S = 1.0  # between tries to begin a file after a failed write
 
 
@@ -478,15 +479,14 @@ class Rotation:
         self._retry_s = self._clock()
 
     def begin(self, write_note: Callable[[str], object]) -> None:
-        """Open the next file; a later one than the first repeats the header.
+        """Open the next file, under the next free name; a later one than the first repeats the header.
 
         Raises:
             OSError: it cannot be opened or written.
         """
-        path = make_segment_path(self._path, self.number)
-        path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
-        self._segment = Segment(self._open_file(path), self._log.chunk_bytes, self.zero_utc_ns)
-        self._opened = path.stat()
+        self._path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
+        self._segment = Segment(self._open_next(), self._log.chunk_bytes, self.zero_utc_ns)
+        self._opened = make_segment_path(self._path, self.number).stat()
         self._preface = 0
         if self.number > 1:
             self._preface = 1 + bool(self._header)
@@ -495,14 +495,28 @@ class Rotation:
             write_note(self.because)
             self._segment.attach(self._attachments)
 
+    def _open_next(self) -> OutputFile:
+        """Open a file under the next name that nobody has taken."""
+        for _ in range(MAX_TAKEN_NAMES):
+            try:
+                return self._open_file(make_segment_path(self._path, self.number))
+            except FileExistsError:
+                self.number += 1
+        return self._open_file(make_segment_path(self._path, self.number))
+
     def write(self, topic: str, at_ns: int, data: bytes) -> None:
         """Add a message to the open file.
 
         Raises:
             OSError: a chunk could not be written; `fail` keeps what it held, this message included.
         """
-        self.written += 1
-        self._open_segment().add(QueuedMessage(get_definition(topic), self.written, at_ns, data))
+        segment = self._open_segment()
+        entry = QueuedMessage(get_definition(topic), self.written + 1, at_ns, data)
+        try:
+            segment.add(entry)
+        finally:
+            if segment.open_entries and segment.open_entries[-1] is entry:  # else it is lost, and takes no number
+                self.written += 1
 
     def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
         """Add a record's message; the header is kept for later files.
@@ -567,10 +581,10 @@ class Rotation:
         segment.finish()
         self._retire(segment, there=self._is_present(segment))
 
-    def fail(self, error: OSError) -> None:
+    def fail(self, error: Exception) -> None:
         """Handle a failed write: keep the messages of the open chunk, and close the file as well as possible."""
         self.failures += 1
-        self.reason = str(error)
+        self.reason = str(error) or type(error).__name__
         self.because = f"after a failed write: {self.reason}"
         self._retry_s = self._clock() + RETRY_S
         segment = self._segment

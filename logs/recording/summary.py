@@ -21,6 +21,7 @@ from uavctl.arrays import Array
 from uavctl.cause import CAUSES, Cause
 from uavctl.config.load import parse_stored_toml
 from uavctl.config.mission import FenceConfig
+from uavctl.errors import ConfigError
 from uavctl.number_text import format_duration, format_number, format_percent_above
 from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector
 

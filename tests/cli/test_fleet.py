@@ -209,13 +209,22 @@ def read_status(path: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.slow
-@pytest.mark.fault(70)
-@pytest.mark.parametrize("how", ["ctrl-c", "order", "a daemon is killed", "the fleet is killed"])
+@pytest.mark.fault(70, 86)
+@pytest.mark.parametrize(
+    "how", ["ctrl-c", "ctrl-c twice", "the terminal is closed", "order", "a daemon is killed", "the fleet is killed"]
+)
 def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None:
     with fly_fleet() as (path, truths, fleet):
         lands = set(truths)
         if how == "ctrl-c":
             fleet.send_signal(signal.SIGINT)
+        elif how == "ctrl-c twice":
+            fleet.send_signal(signal.SIGINT)
+            wait_until(lambda: all(health["mode"] != "track" for health in read_status(path)), "their end begins")
+            fleet.send_signal(signal.SIGINT)
+        elif how == "the terminal is closed":
+            fleet.send_signal(signal.SIGHUP)
+            fleet.send_signal(signal.SIGHUP)
         elif how == "order":
             assert run(["fleet", "land", str(path), "--control", str(path.parent / "c")]) == 0
         elif how == "a daemon is killed":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
+import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,16 +13,19 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from natnet_server import Body, Server
+from natnet_server import Body, Server, message
 from numpy.typing import NDArray
 from operation_rig import Scene, end_process, open_scene
 from patience import LIMIT_S, wait_until
+from process_rig import child_of
 from sim_rig import decode
 
 from logs.recording.reader import records
 from sim.cameras import UPTIME_S
 from uavctl.cli.app import run
-from uavctl.records import ControlMode, Decision, StepInput
+from uavctl.event_codes import EventCode
+from uavctl.io.natnet import ECHO
+from uavctl.records import ControlMode, Decision, Event, StepInput
 
 
 @contextmanager
@@ -74,6 +79,40 @@ def test_it_flies_on_a_body_of_motive_s_and_replays_without_it() -> None:
         way = np.array([one.position_m for one in air.truths])
         assert max(off_m(np.array(one.position_m), way) for one in samples) < 0.1
         assert server.echo_answers > 0
+        assert run(["log", "replay", str(recording)]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.fault(91, 92)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_it_flies_on_after_a_forged_answer_and_after_the_death_of_the_process(autopilot: str) -> None:
+    overrides = ("sim.camera.rate_hz=60.0", "link.loss=0.0", "link.delay_s=0.0", "link.jitter_s=0.0")
+    with open_scene(*overrides, f'sim.autopilot="{autopilot}"') as air:
+        recording = air.folder / "f" / "flight.mcap"
+
+        def count_tracking() -> int:
+            return sum(decision.mode is ControlMode.TRACK for decision in records(recording, Decision))
+
+        def is_tracking_on(more: int) -> bool:
+            return count_tracking() >= more
+
+        with seen_by_motive(air) as server, end_process(air.fly("f")) as process:
+            wait_until(recording.exists, "it records")
+            wait_until(lambda: is_tracking_on(40), "it flies")
+            child = child_of(process.pid, "uavctl.io.camera_host")
+            server.send(message(ECHO, struct.pack("<QQ", 1, 2**64 - 1)))
+            flown = count_tracking()
+            wait_until(lambda: is_tracking_on(flown + 40), "it flies on after the forged answer")
+            assert child_of(process.pid, "uavctl.io.camera_host") == child
+            os.kill(child, signal.SIGKILL)
+            wait_until(lambda: any(e.code == EventCode.PROCESS_ENDED for e in records(recording, Event)), "it is told")
+            flown = count_tracking()
+            wait_until(lambda: is_tracking_on(flown + 40), "it flies on after the death of the process")
+            process.send_signal(signal.SIGINT)
+            answer, errors = process.communicate(timeout=LIMIT_S)
+        assert process.returncode == 0, answer
+        assert "signal 9" in errors
+        wait_until(lambda: air.has_landed, "the vehicle lands")
         assert run(["log", "replay", str(recording)]) == 0
 
 

@@ -7,6 +7,7 @@ import os
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -14,25 +15,28 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 
 import pytest
-from natnet_server import UPTIME_S, Body, Server
+from natnet_server import UPTIME_S, Body, Server, message
 from patience import LIMIT_S, wait_until
+from process_rig import child_of, running
 
 from uavctl.config import Config, load_config
 from uavctl.config.connections import find_security_warnings
 from uavctl.errors import ConfigError, ConnectionSpecError, ExtraMissingError
+from uavctl.event_codes import EventCode
 from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
 from uavctl.io.camera import COUNTS, READY, BodyPose, Echo
 from uavctl.io.camera_host import OVERRUN, CameraHost
+from uavctl.io.camera_process import MAX_RESTARTS
+from uavctl.io.natnet import ECHO
 from uavctl.io.signed_connection import open_links
 from uavctl.io.sources import open_source
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Position
-from uavctl.records import PositionSample
+from uavctl.records import PositionSample, Severity
 
 HOST = "uavctl.io.camera_host"
 DRONE, OTHER = Body(7, "drone 1", (1.0, 1.5, 2.0)), Body(3, "table")
@@ -166,7 +170,7 @@ def test_a_group_is_joined() -> None:
         desk.wait_until(lambda: len(desk.samples) > 3)
 
 
-def test_the_process_ends_with_the_daemon_and_the_connection_with_the_process() -> None:
+def test_the_process_ends_with_the_daemon() -> None:
     with Server([DRONE]) as server:
         daemon = (
             f"from uavctl.io.sources import open_source; c = open_source({url(server)!r}); print(flush=True); input()"
@@ -179,31 +183,37 @@ def test_the_process_ends_with_the_daemon_and_the_connection_with_the_process() 
             process.kill()
         wait_until(lambda: not running(child), "the process ends")
 
-        with closing(open_source(url(server))) as connection:
-            desk = Desk(connection, load_config("room-hahn-stursberg"))
-            desk.wait_until(lambda: bool(desk.samples))
+
+@pytest.mark.slow
+@pytest.mark.fault(92)
+def test_92_a_process_that_dies_is_reported_and_started_again_for_a_limited_number_of_times() -> None:
+    with Server([DRONE]) as server, closing(open_source(url(server))) as connection:
+        desk = Desk(connection, load_config("room-hahn-stursberg"))
+        reported: Counter[str] = Counter()
+        for _ in range(MAX_RESTARTS + 1):
+            count, told = len(desk.samples), reported.total()
+            desk.wait_until(lambda count=count: len(desk.samples) > count)  # type: ignore[misc]
             os.kill(child_of(os.getpid(), HOST), signal.SIGKILL)
-            desk.wait_until(lambda: connection.closed)
-            connection.send(b"to nobody")
-            assert connection.send_errors == 1
+            desk.wait_until(lambda told=told: connection.refused.total() > told)  # type: ignore[misc]
+            events = desk.link.add_refusals(connection.refused - reported, time.monotonic_ns())
+            assert [event.severity for event in events if event.code == EventCode.PROCESS_ENDED] == [Severity.ERROR]
+            reported = Counter(connection.refused)
+        assert connection.closed
+        connection.send(b"to nobody")
+        assert connection.send_errors == 1
 
 
-def running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def child_of(parent: int, words: str) -> int:
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            above = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            if above == parent and words in (folder / "cmdline").read_text():
-                return int(folder.name)
-        except OSError:  # it has just ended
-            continue
-    raise AssertionError(f"no child runs {words}")
+@pytest.mark.fault(91)
+def test_91_a_forged_answer_with_a_time_that_cannot_be_is_ignored_and_counted() -> None:
+    with Server([DRONE]) as server, closing(open_source(url(server))) as connection:
+        desk = Desk(connection, load_config("room-hahn-stursberg"))
+        desk.wait_until(lambda: bool(desk.samples))
+        child = child_of(os.getpid(), HOST)
+        server.send(message(ECHO, struct.pack("<QQ", 1, 2**64 - 1)))
+        desk.wait_until(lambda: connection.refused["unreadable"] == 1)
+        count = len(desk.samples)
+        desk.wait_until(lambda: len(desk.samples) > count)
+        assert child_of(os.getpid(), HOST) == child
 
 
 @pytest.mark.parametrize(

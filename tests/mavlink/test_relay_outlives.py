@@ -104,26 +104,49 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
 
 
 @pytest.mark.slow
-@pytest.mark.fault(64)
+@pytest.mark.fault(64, 88)
 @pytest.mark.usefixtures("control_may_fail")
-def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = airborne("px4")
+@BOTH
+def test_a_hand_over_that_fails_requests_landing_and_leaves_the_positions_until_the_vehicle_is_down(
+    monkeypatch: pytest.MonkeyPatch, autopilot: str
+) -> None:
+    flight = airborne(autopilot)
 
     def faulty(hand_over: HandoverStateMachine, view: HandoverInput) -> HandoverOutput:
         raise LookupError("no such state")
 
     monkeypatch.setattr(HandoverStateMachine, "update", faulty)
     failed_ns = flight.now_ns
-    flight.run(10.0)
+    flight.run(2.0)
+    assert flight.peers.autopilot.mode_name == ("AUTO.LAND" if autopilot == "px4" else "LAND")
     assert not flight.loop.finished and poses_after(flight, flight.now_ns - SECOND)
     assert not flight.setpoints_between(failed_ns, flight.now_ns)
-    flight.stick("AUTO.LAND")
-    for _ in range(40):
+    for _ in range(60):
         if flight.loop.finished:
             break
         flight.run(1.0)
     assert flight.loop.finished and flight.peers.autopilot.vehicle.landed
     assert [event.code for event in flight.memory.of(Event)].count("control") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.fault(88)
+@pytest.mark.usefixtures("control_may_fail")
+@BOTH
+def test_a_hand_over_that_fails_requests_nothing_of_a_vehicle_that_the_pilot_has(
+    monkeypatch: pytest.MonkeyPatch, autopilot: str
+) -> None:
+    flight = airborne(autopilot)
+    flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
+    flight.run(3.0, until=HandoverState.TAKEN_OVER)
+    before = flight.commands()
+
+    def faulty(hand_over: HandoverStateMachine, view: HandoverInput) -> HandoverOutput:
+        raise LookupError("no such state")
+
+    monkeypatch.setattr(HandoverStateMachine, "update", faulty)
+    flight.run(5.0)
+    assert flight.commands() == before
 
 
 @pytest.mark.slow

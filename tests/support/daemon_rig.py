@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from loopback_rig import MemorySink, shared_loop
 from sim_rig import decode
@@ -11,8 +11,9 @@ from sim_rig import decode
 from sim.simulation import Peers
 from uavctl.clock import Ticker
 from uavctl.config import load_config
-from uavctl.daemon.daemon import fly
+from uavctl.daemon.daemon import AfterTick, fly
 from uavctl.io.base import Connection
+from uavctl.records import Event
 
 TICK_NS, DT_NS, SECOND = 50_000_000, 200_000_000, 1_000_000_000
 
@@ -30,7 +31,14 @@ class DaemonRig:
         self.connections = {name: PeerConnection(self, name) for name in self.arrived}
         self.told: list[tuple[str, int]] = []  # words for a person, and when they were told
         self.arrives: list[tuple[int, bytes]] = []  # what comes between ticks
+        self.services: list[AfterTick] = [
+            lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.news)
+        ]
+        self.engagement: AfterTick = lambda *_: None
         self.oversleep: dict[int, int] = {}  # deadline -> how much later the sleep ends
+
+    def tell(self, news: Sequence[Event]) -> None:
+        self.told.extend((event.text, self.now_ns) for event in news)
 
     def wait(self, connections: Mapping[str, Connection], deadline_ns: int) -> list[str]:
         del connections
@@ -52,8 +60,9 @@ class DaemonRig:
             lambda: self.now_ns >= stop_at_s * SECOND,
             duration_s=duration_s,
             stop_limit_s=stop_limit_s,
-            after_tick=(lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.news),),
-            on_events=lambda news: self.told.extend((e.text, self.now_ns) for e in news),
+            engagement=self.engagement,
+            after_tick=self.services,
+            on_events=self.tell,
             wait_for=self.wait,
             now=lambda: self.now_ns,
         )

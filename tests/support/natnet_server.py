@@ -125,6 +125,11 @@ class Server:
         self._thread.join()
         self._socket.close()
 
+    def send(self, data: bytes) -> None:
+        """Send a datagram to the client, as anybody can who forges the server's address."""
+        assert self._client is not None
+        self._socket.sendto(data, self._client)
+
     def _serve(self) -> None:
         next_s, last_s = time.monotonic(), 0.0
         while not self._over.is_set():

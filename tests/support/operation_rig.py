@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ class VehicleTap:
         self.spoken = 0  # datagrams of the daemon's
         self._marked = threading.Event()
         self._daemon = ("127.0.0.1", daemon_port)
-        self._ours, self._theirs = reserve_port(), reserve_port()
+        self._ours, self._old, self._theirs = reserve_port(), reserve_port(), reserve_port()
         self.vehicle_port = int(self._theirs.getsockname()[1])
         self._vehicle: Any = None
         self._done = threading.Event()
@@ -58,13 +58,13 @@ class VehicleTap:
 
     def _run(self) -> None:
         while not self._done.is_set():
-            ready, _, _ = select.select([self._ours, self._theirs], [], [], 0.05)
+            ready, _, _ = select.select([self._ours, self._old, self._theirs], [], [], 0.05)
             if self._theirs in ready:
                 data, self._vehicle = self._theirs.recvfrom(65_536)
                 self._ours.sendto(data, self._daemon)
-            if self._ours in ready:
+            for sock in {self._ours, self._old}.intersection(ready):
                 try:
-                    data = self._ours.recv(65_536)
+                    data = sock.recv(65_536)
                 except ConnectionRefusedError:
                     continue  # nobody listens at the daemon's port
                 if data == MARK:
@@ -87,11 +87,15 @@ class VehicleTap:
         message = mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32)
         self._theirs.sendto(Client().pack(message), self._vehicle)
 
+    def change_port(self) -> None:
+        """Talk to the daemon from another port from now on; what it sends to the old one still comes in."""
+        self._old, self._ours = self._ours, self._old
+
     def close(self) -> None:
         self._done.set()
         self._thread.join()
-        self._ours.close()
-        self._theirs.close()
+        for sock in (self._ours, self._old, self._theirs):
+            sock.close()
 
 
 class Scene:
@@ -109,24 +113,33 @@ class Scene:
     @property
     def has_landed(self) -> bool:
         """Whether it has been landing; once disarmed, a PX4 takes up the mode of before."""
-        return any(truth.mode == "AUTO.LAND" for truth in self.truths)
+        return any(truth.mode in ("AUTO.LAND", "LAND") for truth in self.truths)
 
     def wait_for_flight(self, seconds: float) -> None:
         """Let some of the vehicle's own time go by."""
         end_ns = self.truths[-1].at_ns + round(seconds * 1e9)
         wait_until(lambda: self.truths[-1].at_ns >= end_ns, f"{seconds:g} s on board")
 
-    def fly(self, out: str, *options: str, environ: dict[str, str] | None = None) -> subprocess.Popen[str]:
+    def fly(
+        self,
+        out: str,
+        *options: str,
+        environ: dict[str, str] | None = None,
+        stderr: int | None = subprocess.PIPE,
+        preexec_fn: Callable[[], object] | None = None,
+        json: bool = True,
+    ) -> subprocess.Popen[str]:
         """The daemon, ready to fly or already over."""
         urls = ["--vehicle", self.vehicle, "--mocap", self.mocap]
         patience = [argument for setting in PATIENT_DAEMON for argument in ("--set", setting)]
-        command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, "--json"]
+        command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, *(["--json"] if json else [])]
         places = ["--out", str(self.folder / out), "--control", str(self.control)]
         return subprocess.Popen(
             [*command, *places, *options],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=stderr,
             text=True,
+            preexec_fn=preexec_fn,
             env=without_pages(environ or os.environ),
         )
 

@@ -7,7 +7,10 @@ import os
 import sys
 import threading
 from collections.abc import Mapping
+from traceback import format_exc
 from typing import NoReturn
+
+from uavctl.cli.error_stream import finish_streams, prepare_streams
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 INTERRUPTED = 130  # exit code of a shell for a command that SIGINT ended
@@ -21,6 +24,7 @@ def main() -> None:
         os.environ.setdefault(variable, "1")
     # Imported modules stay: the search for garbage among them would take a fifth of the start.
     gc.disable()
+    prepare_streams()
     try:
         from uavctl.cli.app import run
 
@@ -30,6 +34,11 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         code = INTERRUPTED
+    except Exception:  # noqa: BLE001 an error that nobody expected
+        sys.stderr.write(format_exc())
+        code = 1
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 1
     _end_process(code)
 
 
@@ -38,8 +47,8 @@ def _end_process(code: int) -> NoReturn:
 
     A thread that waits for standard input holds the lock of the stream; the end of the interpreter would abort on it.
     """
+    finish_streams()
     if any(thread.daemon for thread in threading.enumerate()):
-        sys.stdout.flush()
         os._exit(code)
     sys.exit(code)
 
@@ -47,7 +56,7 @@ def _end_process(code: int) -> NoReturn:
 def restart_process(environ: Mapping[str, str]) -> None:
     """Restart this process with its command line and this environment; do nothing if the process is not `uavctl`."""
     if _arguments is not None:
-        sys.stdout.flush()
+        finish_streams()
         os.execve(sys.executable, [sys.executable, "-m", "uavctl", *_arguments], dict(environ))
 
 

@@ -19,7 +19,7 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 
 from uavctl.cli import INTERRUPTED
 from uavctl.cli.common import Common, make_progress, make_table, print_message
-from uavctl.cli.flying import stop_on_signals
+from uavctl.cli.signals import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes

@@ -35,7 +35,7 @@ from uavctl.cli.common import (
     make_key_overrides,
     print_message,
 )
-from uavctl.cli.flying import stop_on_signals
+from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.config.connections import CheckConfig, find_security_warnings

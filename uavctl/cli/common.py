@@ -6,7 +6,6 @@ is never markup: paths, units and texts of vehicles have brackets. Styles are th
 
 from __future__ import annotations
 
-import os
 import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -251,21 +250,12 @@ def make_progress(*columns_after: ProgressColumn, auto_refresh: bool = True) -> 
     return _ProgressLines(*head, *trailing, console=make_message_console(), transient=True, auto_refresh=auto_refresh)
 
 
-class _MessageConsole(Console):
-    """Standard error that may be closed: a flight goes on without a reader of its messages."""
-
-    def on_broken_pipe(self) -> None:
-        """Discard further output; rich itself would end the program."""
-        with open(os.devnull, "w") as null_file:  # noqa: PTH123 (a name of the system's, not a path)
-            os.dup2(null_file.fileno(), sys.stderr.fileno())
-
-
 def make_message_console() -> Console:
     """Return the console for messages and progress: standard error.
 
     It counts as interactive also for a file or a pipe. So rich shows no progress there, and no empty line for a bar.
     """
-    return _MessageConsole(stderr=True, force_interactive=True, markup=False, emoji=False)
+    return Console(stderr=True, force_interactive=True, markup=False, emoji=False)
 
 
 def make_output_console() -> Console:

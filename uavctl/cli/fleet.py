@@ -39,6 +39,7 @@ from uavctl.cli.common import (
 )
 from uavctl.cli.ctl import send_request
 from uavctl.cli.health_lines import hide_health_lines
+from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.usage import format_example
 from uavctl.config import Config, load
 from uavctl.config.checks import get_position_limits_m
@@ -215,18 +216,18 @@ def fly(
     options = [*(("--duration", str(duration)) if duration is not None else ())]
     options += ["--arm", "--takeoff", str(takeoff)] if takeoff is not None else []
     flights = [FleetFlight(member, [*options, "--out", str(out / member.name)]) for member in fleet.members]
-    with _catch_first_signal() as stop_requested, _show_status(flights) as health:
+    with stop_on_signals() as stopped, _show_status(flights) as health:
         for flight in flights:
             flight.start()
         is_landing = False
         while any(flight.is_running() for flight in flights):
-            reason = "asked to" if stop_requested.is_set() else _find_failure(flights, health)
+            reason = "asked to" if stopped() else _find_failure(flights, health)
             if reason and not is_landing:
                 is_landing = True
                 print_message(f"{reason}: all vehicles end their flights")
                 for flight in flights:
                     flight.request_fallback()
-            stop_requested.wait(POLL_S) if not is_landing else time.sleep(POLL_S)
+            time.sleep(POLL_S)
         for flight in flights:
             flight.join_output()
     document = {
@@ -332,20 +333,6 @@ def run_fleet_daemon() -> None:
     threading.Thread(target=wait_for_close, name="fleet", daemon=True).start()
     hide_health_lines()  # the fleet's table has the health of each vehicle
     main()
-
-
-@contextmanager
-def _catch_first_signal() -> Iterator[threading.Event]:
-    """Catch Ctrl-C and SIGTERM; only the first one counts, since all vehicles land then."""
-    stop_requested = threading.Event()
-    previous = {
-        number: signal.signal(number, lambda *_: stop_requested.set()) for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield stop_requested
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _find_failure(flights: Sequence[FleetFlight], health_by_name: HealthByName) -> str:

@@ -37,11 +37,11 @@ from uavctl.cli.flying import (
     order_stand_by,
     print_ending,
     record_failure,
-    stop_on_signals,
     wait_for_server,
 )
 from uavctl.cli.live_line import show_live_line
 from uavctl.cli.services import enable_realtime_process, run_services
+from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import LoadedConfig
 from uavctl.config.connections import find_security_warnings
@@ -184,11 +184,11 @@ def fly_daemon(
                         stopped,
                         duration_s=duration_s,
                         stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
+                        engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
                         after_tick=(
                             feed.after_tick,
                             lambda *_: vehicle_lock.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
-                            lambda ticked, _: engagement.handle_tick(loop, ticked),
                             *service_functions,
                             *garbage_functions,
                         ),

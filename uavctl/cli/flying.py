@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pickle
-import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,8 +22,9 @@ from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, label_text, print_message
+from uavctl.cli.signals import SIGNAL_EXIT_BASE
 from uavctl.daemon.engagement import make_goto_keys
-from uavctl.errors import ConnectionClosedError, EndedBySignal, RecordingError, UavctlError, UsageError, in_words
+from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, Ending, Order
 
@@ -85,7 +84,6 @@ def print_ending(ending: Ending) -> None:
         print_message(label_text("relay", ending.relay, "bold"))
 
 
-SIGNAL_EXIT_BASE = 128  # exit codes of a process that a signal has ended are this much higher than its number
 LIVE_PORT = 8765  # where Foxglove looks first
 Live = Annotated[
     bool,
@@ -187,7 +185,10 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
         UavctlError: The page cannot be written; the recording is unchanged.
     """
     command = [sys.executable, "-P", "-m", "logs.report.flight_page", str(path), str(page)]
-    process = subprocess.run(command, input=pickle.dumps(summary), capture_output=True, check=False)
+    try:
+        process = subprocess.run(command, input=pickle.dumps(summary), capture_output=True, check=False)
+    except OSError as error:  # no memory, or no descriptor left
+        raise UavctlError(f"{page}: {error.strerror}; `uavctl log report {path}` draws the page later") from error
     if process.returncode:
         error_lines = process.stderr.decode(errors="replace").strip().splitlines()
         reason = error_lines[-1] if error_lines else f"its process ended with {process.returncode}"
@@ -208,25 +209,6 @@ def record_failure(loop: ControlLoop) -> Iterator[None]:
     except Exception as error:
         loop.account.control_error = in_words(error)
         raise
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Yield a function that says whether Ctrl-C or SIGTERM has come; a second signal ends the process at once."""
-    stop_requested = threading.Event()
-
-    def request_stop(number: int, frame: object) -> None:
-        del frame
-        if stop_requested.is_set():
-            raise EndedBySignal(SIGNAL_EXIT_BASE + number)
-        stop_requested.set()
-
-    previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop_requested.is_set
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 SERVER_RETRY_S = 1.0

@@ -6,7 +6,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
@@ -125,15 +125,19 @@ def show_live_line(
 
         def refresh() -> None:
             while not done.wait(REFRESH_S):
-                print_events()
-                ticked = feed.ticked
-                print_notices(feed.notices, console)
-                if loop.breach_reason and not release_shown.is_set():
-                    release_shown.set()
-                    console.print(label_text("letting go", loop.breach_reason, "bold red"), soft_wrap=True)
-                if ticked is not None:
-                    line = _format_state(ticked, loop.handover_state) + _format_recorder_warning(get_status())
-                    progress.update(task, completed=ticked.decision.tick * tick_s, line=line)
+                with suppress(Exception):  # no memory, say: the next line tries again
+                    show()
+
+        def show() -> None:
+            print_events()
+            ticked = feed.ticked
+            print_notices(feed.notices, console)
+            if loop.breach_reason and not release_shown.is_set():
+                release_shown.set()
+                console.print(label_text("letting go", loop.breach_reason, "bold red"), soft_wrap=True)
+            if ticked is not None:
+                line = _format_state(ticked, loop.handover_state) + _format_recorder_warning(get_status())
+                progress.update(task, completed=ticked.decision.tick * tick_s, line=line)
 
         thread = threading.Thread(target=refresh, name="live", daemon=True)
         thread.start()

@@ -42,9 +42,9 @@ from uavctl.cli.flying import (
     open_viewers,
     print_ending,
     record_failure,
-    stop_on_signals,
 )
 from uavctl.cli.live_line import show_live_line
+from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
@@ -188,12 +188,8 @@ def _fly_real_time(prepared: Prepared, path: Path, engagement: Engagement, viewe
                     stopped,
                     duration_s=config.duration_s,
                     stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
-                    after_tick=(
-                        feed.after_tick,
-                        lambda *_: recorder.catch_up(),
-                        lambda ticked, _: engagement.handle_tick(loop, ticked),
-                        collector.after_tick,
-                    ),
+                    engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
+                    after_tick=(feed.after_tick, lambda *_: recorder.catch_up(), collector.after_tick),
                     on_events=feed.events.extend,
                 )
             wall_s = time.perf_counter() - begin_s

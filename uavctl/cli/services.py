@@ -12,7 +12,7 @@ from rich.text import Text
 
 from logs.recording.recorder import RecorderStatus
 from uavctl.cli.common import label_text, print_message
-from uavctl.cli.health_lines import write_health_lines
+from uavctl.cli.health_lines import choose_line_writer
 from uavctl.config import Config
 from uavctl.daemon.control_socket import ControlServer, make_daemon_name
 from uavctl.daemon.daemon import AfterTick
@@ -31,26 +31,25 @@ def run_services(
     Raises:
         UsageError: A variable of the service manager is not valid.
     """
-    notifier = Notifier()
-    with write_health_lines() as write_line:
+    notifier, write_line = Notifier(), choose_line_writer()
 
-        def report_health(line: str) -> None:
-            notifier.send_status(line)
-            write_line(line)
+    def report_health(line: str) -> None:
+        notifier.send_status(line)
+        write_line(line)
 
-        def get_recorder_health() -> RecorderHealth:
-            return make_recorder_health(status(), path)
+    def get_recorder_health() -> RecorderHealth:
+        return make_recorder_health(status(), path)
 
-        identity = (make_daemon_name(config), config.daemon.vehicle, os.getpid())
-        monitor = HealthMonitor(loop, config, identity, get_recorder_health, report_health)
-        server = ControlServer(listener, config, loop, monitor.make_health)
-        try:
-            # The sign of life comes last: it confirms all work of the tick.
-            yield monitor.after_tick, server.after_tick, notifier.after_tick
-        finally:
-            notifier.send_status(f"ended: {loop.ending.sentence}")
-            server.close()
-            notifier.close()
+    identity = (make_daemon_name(config), config.daemon.vehicle, os.getpid())
+    monitor = HealthMonitor(loop, config, identity, get_recorder_health, report_health)
+    server = ControlServer(listener, config, loop, monitor.make_health)
+    try:
+        # The sign of life comes last: it confirms all work of the tick.
+        yield monitor.after_tick, server.after_tick, notifier.after_tick
+    finally:
+        notifier.send_status(f"ended: {loop.ending.sentence}")
+        server.close()
+        notifier.close()
 
 
 @contextmanager

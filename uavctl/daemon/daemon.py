@@ -1,17 +1,27 @@
 """Flight daemon: wait, receive, step, send, record.
 
 No other thread sends setpoints. If the loop ends, the setpoints end too.
+
+An error ends no flight without a landing request:
+1. In what the flight does not need (services, bookkeeping, one datagram): it is reported, and the flight goes on.
+2. In what gives the orders of the flight: the flight ends as if that were asked for.
+3. In a cycle: no setpoint any more; the next cycles ask for landing and pass positions on.
+4. In several cycles in a row: a landing request of its own is sent until it is answered.
 """
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+
+from msgspec.structs import replace
 
 from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
 from uavctl.clock import Ticker, monotonic_ns
-from uavctl.errors import ConnectionClosedError
+from uavctl.errors import ConnectionClosedError, UavctlError
 from uavctl.event_codes import EventCode
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
@@ -24,9 +34,13 @@ STALL_NS = 200_000_000  # between reads: the system may have dropped the vehicle
 MAX_READ_AGE_NS = 150_000_000  # largest age of the last complete read at a setpoint
 MAX_READ_ROUNDS = 10  # at a backlog, before a tick
 WITHHELD = "withheld"
+MAX_FAILED_CYCLES = 3  # in a row
+MAX_FAILED_READS = 20  # cycles in a row in which the vehicle's connection cannot be read: a second
+RESERVE_BYTES = 2**20  # given back after the first failure, which may be one of memory
+ANSWER_PAUSE_NS = 50_000_000  # between two looks for the answer to the last landing request
 
 AfterTick = Callable[[Ticked, int], None]
-"""Called with the result of a tick and its lateness [ns], after its setpoint; must neither wait nor raise."""
+"""Called with the result of a tick and its lateness [ns], after its setpoint; must not wait."""
 
 
 def fly(
@@ -37,6 +51,7 @@ def fly(
     *,
     duration_s: float | None = None,
     stop_limit_s: float,
+    engagement: AfterTick = lambda *_: None,
     after_tick: Sequence[AfterTick] = (),
     on_events: Callable[[tuple[Event, ...]], None] = lambda _: None,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
@@ -50,8 +65,9 @@ def fly(
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
         stop_limit_s: the hand-over ends after this time [s] at the latest, unless the vehicle is in the air on relayed
             positions; 0 ends without one.
-        after_tick: called in this order after each tick.
-        on_events: called with the events for people from a datagram or a lost connection; must neither wait nor raise.
+        engagement: called after each tick; gives the orders of the flight. The hand-over begins if it raises.
+        after_tick: services, called in this order after each tick; their errors are reported.
+        on_events: called with the events for people; must not wait.
         wait_for: sleeps until a deadline or the first arrival; returns the names of connections to read.
         now: the clock [ns].
 
@@ -60,61 +76,186 @@ def fly(
 
     Raises:
         ConnectionClosedError: the vehicle's connection was closed by the other side.
+        Exception: of `engagement`, after the end of the flight; of cycles that fail in a row, after a landing request.
     """
-    first_ns: int | None = None
-    stop_ns: int | None = None
-    reporter = _RefusalReporter(loop, connections, on_events)
-    reader = _Reader(loop, connections, now, on_events)
-    withheld = 0
-
-    def send(message: Outgoing) -> None:
-        nonlocal withheld
-        if message.link == VEHICLE and not reader.is_fresh:
-            withheld += 1  # a pilot may have taken over since the last read
-        else:
-            connections[message.link].send(message.data)
-
+    flight = _Flight(loop, connections, ticker, on_events, wait_for, now)
+    flight.stop_requested, flight.duration_s, flight.stop_limit_s = stop_requested, duration_s, stop_limit_s
+    flight.engagement, flight.services = engagement, after_tick
     try:
-        while not loop.finished:
-            due = ticker.next()
-            while True:
-                has_received = reader.read(wait_for(connections, due.at_ns))
-                if now() >= due.at_ns:
-                    break
-                if not has_received:  # a flood: read several datagrams at once
-                    wait_for({}, min(due.at_ns, now() + READ_PAUSE_NS))
-            if connections[VEHICLE].closed:
-                loop.account.note_closed_connection(
-                    f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it"
-                )
-                raise ConnectionClosedError(
-                    f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
-                    "the vehicle's own failsafe has it. See to the link and start again"
-                )
-            reader.read_backlog()
-            due = ticker.update_after_wait(due)
-            started_ns = now()
-            first_ns = due.at_ns if first_ns is None else first_ns
-            is_time_over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
-            if stop_ns is None and (is_time_over or stop_requested()):
-                stop_ns = due.at_ns
-                loop.account.note_requested_end(Cause.TIME_OVER if is_time_over else Cause.ENDED_BY_OPERATOR)
-            is_overdue = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
-            if is_overdue and not (stop_limit_s and loop.is_relay_needed):
-                break
-            withheld = 0
-            ticked = loop.tick(due.tick, due.at_ns, send, due.missed, stop=stop_ns is not None)
-            if withheld:
-                loop.refused(VEHICLE, {WITHHELD: withheld}, now())
-            loop.timing(ticked, started_ns - due.at_ns, now() - due.at_ns)
-            if loop.outside and ticked.decision.solve is not None:
-                loop.answered(ticked.step_ns)
-            reporter.report(due.at_ns)
-            for callback in after_tick:
-                callback(ticked, started_ns - due.at_ns)
+        return flight.run()
+    except ConnectionClosedError:
+        raise
+    except Exception:
+        flight.request_landing()
+        raise
     finally:
-        reporter.report(now(), is_last=True)
-    return stop_ns is not None
+        flight.report_refusals()
+
+
+class _Flight:
+    """Flight of one vehicle: its cycles, and what is done where they fail."""
+
+    stop_requested: Callable[[], bool]
+    duration_s: float | None
+    stop_limit_s: float
+    engagement: AfterTick
+    services: Sequence[AfterTick]
+
+    def __init__(
+        self,
+        loop: ControlLoop,
+        connections: Mapping[str, Connection],
+        ticker: Ticker,
+        on_events: Callable[[tuple[Event, ...]], None],
+        wait_for: Callable[[Mapping[str, Connection], int], list[str]],
+        now: Callable[[], int],
+    ) -> None:
+        self._loop, self._connections, self._ticker = loop, connections, ticker
+        self._on_events, self._wait_for, self._now = on_events, wait_for, now
+        self._reporter = _RefusalReporter(loop, connections, on_events)
+        self._reader = _Reader(loop, connections, now, on_events, self._report_error)
+        self._first_ns: int | None = None
+        self._stop_ns: int | None = None
+        self._is_over = False
+        self._withheld = 0  # messages to the vehicle in this cycle
+        self._failed_cycles = 0  # in a row
+        self._ticked: Ticked | None = None  # the last tick
+        self._engagement_error: Exception | None = None
+        self._reported_subjects: set[str] = set()
+        self._reserve = bytearray(RESERVE_BYTES)
+
+    def run(self) -> bool:
+        """Run cycles until the end; return whether it was asked for."""
+        while not (self._loop.finished or self._is_over):
+            try:
+                self._run_cycle()
+            except ConnectionClosedError:
+                raise
+            except Exception as error:
+                self._reserve = bytearray()
+                self._failed_cycles += 1
+                event = self._loop.fail(error, self._now())
+                if self._failed_cycles >= MAX_FAILED_CYCLES:
+                    raise
+                self._tell(event)
+            else:
+                self._failed_cycles = 0
+        if self._engagement_error is not None:
+            raise self._engagement_error
+        return self._stop_ns is not None
+
+    def request_landing(self) -> None:
+        """Send the landing request of a flight whose cycles have failed, until it is answered. Services go on."""
+        connection = self._connections[VEHICLE]
+        quiet_tick = None if self._ticked is None else replace(self._ticked, answers=(), news=(), notices=())
+        while not connection.closed and self._loop.send_landing_request(
+            self._now(), lambda message: connection.send(message.data)
+        ):
+            self._attempt_pause()
+            if quiet_tick is not None:
+                self._run_services(self.services, quiet_tick, 0)
+            try:
+                for data, _ in connection.receive():
+                    self._loop.receive_landing_answer(data)
+            except Exception as error:  # noqa: BLE001 it is sent without an answer, for a limited time
+                self._report_error("the answer to the landing request", error)
+
+    def _attempt_pause(self) -> None:
+        try:
+            self._wait_for({}, self._now() + ANSWER_PAUSE_NS)
+        except Exception:  # noqa: BLE001 what has failed in the cycles may be this
+            time.sleep(ANSWER_PAUSE_NS * 1e-9)
+
+    def report_refusals(self) -> None:
+        """Report what the connections have dropped since the last report."""
+        try:
+            self._reporter.report(self._now(), is_last=True)
+        except Exception as error:  # noqa: BLE001 not needed for flying
+            self._report_error("the count of dropped data", error)
+
+    def _run_cycle(self) -> None:
+        loop = self._loop
+        due = self._ticker.next()
+        self._reader.wait(due.at_ns, self._wait_for)
+        self._check_connection()
+        self._reader.read_backlog()
+        due = self._ticker.update_after_wait(due)
+        started_ns = self._now()
+        if self._is_past_limit(due.at_ns):
+            self._is_over = True
+            return
+        self._withheld = 0
+        ticked = loop.tick(due.tick, due.at_ns, self._send, due.missed, stop=self._stop_ns is not None)
+        lateness_ns, send_ns = started_ns - due.at_ns, self._now() - due.at_ns
+        self._follow_engagement(ticked, lateness_ns)
+        bookkeeping: tuple[AfterTick, ...] = (
+            lambda *_: self._report_withheld(),
+            lambda *_: loop.timing(ticked, lateness_ns, send_ns),
+            lambda *_: self._reporter.report(due.at_ns),
+        )
+        if loop.outside and ticked.decision.solve is not None:
+            loop.answered(ticked.step_ns)
+        self._run_services((*bookkeeping, *self.services), ticked, lateness_ns)
+        self._ticked = ticked
+
+    def _run_services(self, services: Sequence[AfterTick], ticked: Ticked, lateness_ns: int) -> None:
+        for number, service in enumerate(services):
+            try:
+                service(ticked, lateness_ns)
+            except Exception as error:  # noqa: BLE001 not needed for flying
+                self._report_error(f"service {number} of the flight", error)
+
+    def _is_past_limit(self, at_ns: int) -> bool:
+        """Note a requested end; return whether its limit is over."""
+        self._first_ns = at_ns if self._first_ns is None else self._first_ns
+        is_time_over = self.duration_s is not None and at_ns - self._first_ns >= self.duration_s * 1e9
+        if self._stop_ns is None and (is_time_over or self.stop_requested()):
+            self._stop_ns = at_ns
+            self._loop.account.note_requested_end(Cause.TIME_OVER if is_time_over else Cause.ENDED_BY_OPERATOR)
+        is_overdue = self._stop_ns is not None and at_ns - self._stop_ns >= self.stop_limit_s * 1e9
+        return is_overdue and not (self.stop_limit_s and self._loop.is_relay_needed)
+
+    def _send(self, message: Outgoing) -> None:
+        if message.link == VEHICLE and not self._reader.is_fresh:
+            self._withheld += 1  # a pilot may have taken over since the last read
+        else:
+            self._connections[message.link].send(message.data)
+
+    def _report_withheld(self) -> None:
+        if self._withheld:
+            self._loop.refused(VEHICLE, {WITHHELD: self._withheld}, self._now())
+
+    def _follow_engagement(self, ticked: Ticked, lateness_ns: int) -> None:
+        """Let the orders of the flight be given; an error begins its end."""
+        if self._engagement_error is not None:
+            return
+        try:
+            self.engagement(ticked, lateness_ns)
+        except Exception as error:  # noqa: BLE001 raised after the end
+            self._engagement_error = error
+            self._stop_ns = ticked.decision.at_ns if self._stop_ns is None else self._stop_ns
+            self._report_error("the orders of the flight", error)
+
+    def _check_connection(self) -> None:
+        connection = self._connections[VEHICLE]
+        if connection.closed:
+            self._loop.account.note_closed_connection(
+                f"{connection.url}; nothing can be sent, and its own failsafe has it"
+            )
+            raise ConnectionClosedError(
+                f"{connection.url}: closed by the other side, so nothing can be sent; "
+                "the vehicle's own failsafe has it. See to the link and start again"
+            )
+
+    def _report_error(self, subject: str, error: Exception) -> None:
+        """Report an error that does not end the flight, once for each subject."""
+        if subject not in self._reported_subjects:
+            self._reported_subjects.add(subject)
+            self._tell(self._loop.note_error(subject, error, self._now()))
+
+    def _tell(self, event: Event) -> None:
+        with suppress(Exception):  # the recording has it
+            self._on_events((event,))
 
 
 class _Reader:
@@ -126,9 +267,13 @@ class _Reader:
         connections: Mapping[str, Connection],
         now: Callable[[], int],
         on_events: Callable[[tuple[Event, ...]], None],
+        report_error: Callable[[str, Exception], None],
     ) -> None:
         self._loop, self._connections, self._now, self._on_events = loop, connections, now, on_events
+        self._report_error = report_error
+        self._failed_reads = 0  # cycles in a row in which the vehicle's connection could not be read
         self._read_ns = now()  # end of the last read
+        self._has_failed = False  # the last read of the vehicle's connection
         self._complete_read_ns: int | None = None  # start of the last read that left nothing
         self._lost = dict.fromkeys(connections, 0)
 
@@ -137,30 +282,57 @@ class _Reader:
         """Whether the last complete read is recent enough to send a setpoint."""
         return self._complete_read_ns is not None and self._now() - self._complete_read_ns <= MAX_READ_AGE_NS
 
+    def wait(self, until_ns: int, wait_for: Callable[[Mapping[str, Connection], int], list[str]]) -> None:
+        """Wait until a time, and pass on what arrives meanwhile."""
+        while True:
+            has_received = self.read(wait_for(self._connections, until_ns))
+            if self._now() >= until_ns:
+                return
+            if not has_received:  # a flood: read several datagrams at once
+                wait_for({}, min(until_ns, self._now() + READ_PAUSE_NS))
+
     def read(self, names: Iterable[str], *, read_all: bool = False) -> bool:
         """Pass on arrivals of the named connections; False if the flight needs none of them."""
         start_ns = self._now()
         has_stalled = start_ns - self._read_ns > STALL_NS
         has_received = False
+        self._has_failed = False
         for name in names:
-            connection = self._connections[name]
-            arrived = connection.receive(read_all=read_all or has_stalled)
-            has_received = has_received or (bool(arrived) and connection.has_known_sender)
-            for index, (data, received_ns) in enumerate(arrived):
-                self._handle_data(name, index, data, received_ns)
+            try:
+                has_received = self._read_connection(name, read_all=read_all or has_stalled) or has_received
+            except Exception as error:  # noqa: BLE001 what is not heard is treated as silent
+                self._has_failed = self._has_failed or name == VEHICLE
+                self._report_error(f"link {name}", error)
         self._report_losses(has_stalled)
         self._read_ns = self._now()
         return has_received
 
+    def _read_connection(self, name: str, *, read_all: bool) -> bool:
+        connection = self._connections[name]
+        arrived = connection.receive(read_all=read_all)
+        for index, (data, received_ns) in enumerate(arrived):
+            self._handle_data(name, index, data, received_ns)
+        return bool(arrived) and connection.has_known_sender
+
     def read_backlog(self) -> None:
-        """Read everything before a setpoint: a backlog ends with the vehicle's newest state."""
+        """Read everything before a setpoint: a backlog ends with the vehicle's newest state.
+
+        Raises:
+            UavctlError: The vehicle's connection could not be read for long; then its messages are not known.
+        """
         for _ in range(MAX_READ_ROUNDS):
             start_ns = self._now()
             self.read(self._connections, read_all=True)
+            if self._has_failed:
+                break
+            self._failed_reads = 0
             if not self._connections[VEHICLE].has_unread:
                 self._complete_read_ns = start_ns
                 if self.is_fresh:
                     return
+        self._failed_reads += self._has_failed
+        if self._failed_reads >= MAX_FAILED_READS:
+            raise UavctlError(f"{self._connections[VEHICLE].url}: cannot be read; see the error before")
 
     def _handle_data(self, name: str, index: int, data: bytes, received_ns: int) -> None:
         connection = self._connections[name]

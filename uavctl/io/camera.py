@@ -75,6 +75,6 @@ class Camera(Protocol):
         ...
 
 
-READY, REFUSED, UNREACHABLE, COUNTS = b"R", b"E", b"T", b"C"
+READY, REFUSED, UNREACHABLE, FAILED, COUNTS = b"R", b"E", b"T", b"F", b"C"
 LARGEST = 65536
 ANSWER_S = 5.0  # limit for the server's answer and the name of the body

@@ -30,7 +30,19 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import CAMERA_SYSTEM_ID
 from uavctl.errors import in_words
 from uavctl.frames import Up
-from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, UNREACHABLE, BodyPose, Camera, CameraError, Echo
+from uavctl.io.camera import (
+    ANSWER_S,
+    COUNTS,
+    FAILED,
+    LARGEST,
+    READY,
+    REFUSED,
+    UNREACHABLE,
+    BodyPose,
+    Camera,
+    CameraError,
+    Echo,
+)
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import TimeSync
 
@@ -81,6 +93,7 @@ def parse_time_requests(data: bytes) -> tuple[int, ...]:
 MAX_QUEUE = 64  # newest messages that are kept while the daemon does not read
 OVERRUN = "source-queue"
 NOT_SERVER = "not-listed"
+UNREADABLE = "unreadable"
 _PIPE_BYTES = 8192  # small kernel buffer: newer messages cannot replace those in it
 _MAX_READS = 64
 _POLL_S = 0.1
@@ -205,12 +218,26 @@ class CameraHost:
             if not self._is_stream and sender[0] != self._server[0]:
                 self._dropped[NOT_SERVER] += 1
                 continue
-            items = self._camera.receive(data, time.monotonic_ns())
+            messages = self._make_messages(data)
             if self._camera.ready and not self._is_ready:  # before any position: the daemon waits for this message
                 self._is_ready = True
                 self._queue_message(READY)
-            for item in items:
-                self._queue_message(self._encoder.encode(item))
+            for message in messages:
+                self._queue_message(message)
+
+    def _make_messages(self, data: bytes) -> list[bytes]:
+        """Return the messages for the daemon that a datagram gives; none of one that cannot be handled.
+
+        Raises:
+            CameraError: the cameras cannot be used.
+        """
+        try:
+            return [self._encoder.encode(item) for item in self._camera.receive(data, time.monotonic_ns())]
+        except CameraError:
+            raise
+        except Exception:  # noqa: BLE001 anybody may send a datagram, and the camera may be of another package
+            self._dropped[UNREADABLE] += 1
+            return []
 
     def _forward_time_requests(self) -> bool:
         """Pass on the daemon's time requests; False if it has gone."""
@@ -311,6 +338,8 @@ def main(arguments: list[str]) -> int:
             pipe.send(REFUSED + str(error).encode())
         except OSError as error:
             pipe.send(UNREACHABLE + str(error.strerror or error).encode())
+        except Exception as error:  # noqa: BLE001 the daemon reports the cause
+            pipe.send(FAILED + in_words(error).encode())
     return 0
 
 

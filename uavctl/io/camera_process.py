@@ -13,21 +13,25 @@ from importlib.util import find_spec
 
 from uavctl.config.connections import get_camera_system
 from uavctl.errors import ConnectionSpecError, ExtraMissingError
+from uavctl.event_codes import EventCode
 from uavctl.io.admission import AdmissionRules, AllowList, RateLimiter
 from uavctl.io.base import BaseConnection, Connection
-from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED
+from uavctl.io.camera import ANSWER_S, COUNTS, FAILED, LARGEST, READY, REFUSED, UNREACHABLE
 from uavctl.io.camera_url import parse_camera_url
 
 _MAVLINK = (0xFD, 0xFE)
 _START_S = 60.0  # for the interpreter of the process, on a busy computer
 _END_S = 2.0
+_EXIT_CODE_S = 0.02  # for the exit code of a process that has closed its end
+PROCESS_ENDED = f"{EventCode.PROCESS_ENDED}: "  # begin of a reason of a loss; its cause follows
+MAX_RESTARTS = 3  # of a process that ends while it is needed
 
 
 class CameraProcessConnection(BaseConnection):
     """A process that gives MAVLink; see `uavctl.io.sources`. Implements `uavctl.io.base.Connection`.
 
-    When the process ends, the connection shows as `closed`; while only its server is gone it asks on, and nothing
-    comes.
+    A process that ends is reported with its cause, and started again `MAX_RESTARTS` times; then the connection shows as
+    `closed`. While only the server is gone the process asks on, and nothing comes.
 
     Args:
         arguments: of `uavctl.io.camera_host`, without the pipe.
@@ -45,20 +49,38 @@ class CameraProcessConnection(BaseConnection):
         self._rate_limiter, self._sender = RateLimiter(rules, self._refused_here), (url, 0)
         self._rate_limiter.trust_sender(self._sender, now())
         self._refused_there: Counter[str] = Counter()  # what the process counted
-        self._socket, peer_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._refused_before: Counter[str] = Counter()  # what earlier processes counted
+        self._restarts = 0
+        self._cause = ""  # last words of the process
+        self._arguments = arguments
+        try:
+            self._start()
+        except OSError as error:  # no memory, or too many processes
+            raise ConnectionSpecError(f"connection {url!r}: its process cannot be started ({error})") from error
+
+    def _start(self) -> None:
+        """Start the process.
+
+        Raises:
+            OSError: The system does not allow that now.
+        """
+        own_socket, peer_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with peer_socket:
-            command = [sys.executable, "-P", "-m", "uavctl.io.camera_host", str(peer_socket.fileno()), *arguments]
+            number = peer_socket.fileno()
+            command = [sys.executable, "-P", "-m", "uavctl.io.camera_host", str(number), *self._arguments]
             try:
                 self._process = subprocess.Popen(
                     command,
-                    pass_fds=(peer_socket.fileno(),),
+                    pass_fds=(number,),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,  # a console that nobody reads would hold it up
                     start_new_session=True,  # an interrupt is for the daemon; this process ends with the pipe
                 )
-            except OSError as error:  # no memory, or too many processes
-                self._socket.close()
-                raise ConnectionSpecError(f"connection {url!r}: its process cannot be started ({error})") from error
+            except OSError:
+                own_socket.close()
+                raise
+        self._socket = own_socket
 
     def wait_until_ready(self) -> None:
         """Wait, for a bounded time, until the cameras have answered and know the body.
@@ -89,7 +111,7 @@ class CameraProcessConnection(BaseConnection):
         """See `Connection`; more than the rules allow is dropped, the oldest first."""
         arrived = super().receive(read_all=read_all)
         taken = self._rate_limiter.admit([self._sender] * len(arrived), [data for data, _ in arrived], self._now())
-        self.refused = self._refused_there + self._refused_here
+        self.refused = self._refused_before + self._refused_there + self._refused_here
         return [item for item, fits in zip(arrived, taken, strict=True) if fits]
 
     def send(self, data: bytes) -> None:
@@ -112,12 +134,45 @@ class CameraProcessConnection(BaseConnection):
     def _read(self) -> bytes | None:
         data = self._socket.recv(LARGEST)
         if not data:
-            self.closed = True
+            self._restart()
         elif data[0] in _MAVLINK:
             return data
         elif data[:1] == COUNTS:
             self._refused_there = Counter(json.loads(data[1:]))
+        elif data[:1] in (REFUSED, UNREACHABLE, FAILED):
+            self._cause = data[1:].decode(errors="replace")
         return None
+
+    def _restart(self) -> None:
+        """Start a process in place of one that has ended, and count its cause as a reason of a loss."""
+        cause = self._cause or self._describe_exit()
+        self._socket.close()
+        self._refused_before += self._refused_there
+        self._refused_there, self._cause = Counter(), ""
+        if self._restarts >= MAX_RESTARTS:
+            self._give_up(f"{cause}; it is not started again")
+            return
+        self._restarts += 1
+        try:
+            self._start()
+        except OSError as error:
+            self._give_up(f"{cause}; it cannot be started again ({error.strerror})")
+            return
+        self._socket.setblocking(False)
+        self._refused_here[f"{PROCESS_ENDED}{cause}; it is started again ({self._restarts} of {MAX_RESTARTS})"] += 1
+
+    def _give_up(self, text: str) -> None:
+        self.closed = True
+        self._refused_here[f"{PROCESS_ENDED}{text}"] += 1
+
+    def _describe_exit(self) -> str:
+        """Return how the process has ended, in words; a process that has only closed its end is killed."""
+        try:
+            code = self._process.wait(_EXIT_CODE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return "it has closed its connection"
+        return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
 def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Connection:

@@ -242,19 +242,22 @@ def _open_peer_socket(
     """Open another socket on the same port, connected to one sender; None if that is not possible."""
     if not hasattr(socket, "SO_REUSEPORT"):
         return None
-    peer_socket = socket.socket(family, socket.SOCK_DGRAM)
+    peer_socket = None
     try:
+        peer_socket = socket.socket(family, socket.SOCK_DGRAM)  # fails where no descriptor is left
         _share_port((*bound, peer_socket), is_shared=True)
         _set_buffer_size(peer_socket, PEER_BUFFER_BYTES)
         peer_socket.bind(bound[0].getsockname())
         peer_socket.connect(sender)
         peer_socket.setblocking(False)
+        _share_port((peer_socket,), is_shared=False)
     except OSError:
-        peer_socket.close()
+        if peer_socket is not None:
+            peer_socket.close()
         return None
     finally:
-        _share_port(bound, is_shared=False)  # only briefly: no other program may use the port
-    _share_port((peer_socket,), is_shared=False)
+        with suppress(OSError):
+            _share_port(bound, is_shared=False)  # only briefly: no other program may use the port
     return peer_socket
 
 

@@ -213,15 +213,22 @@ class MavlinkConnection:
         )
 
     def add_refusals(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
-        """Add counts of data that the connection dropped before decoding: by address, rate or signature."""
-        for reason, count in counts.items():
-            self._count_bad(reason, count)
-        events = tuple(
+        """Add counts of data that the connection dropped before decoding: by address, rate or signature.
+
+        A reason may have a cause behind a colon.
+        """
+        events = [
             self._make_event(at_ns, Severity.ERROR, code, "; ".join(texts))
             for code, texts in DISCONNECT_TEXTS.items()
             if code in counts
-        )
-        return events + self._make_events(at_ns)
+        ]
+        for reason, count in counts.items():
+            code, _, cause = reason.partition(": ")
+            self._count_bad(code, count)
+            if code == EventCode.PROCESS_ENDED:
+                text = f"the process that listens to the cameras has ended: {cause}"
+                events.append(self._make_event(at_ns, Severity.ERROR, EventCode.PROCESS_ENDED, text))
+        return (*events, *self._make_events(at_ns))
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """Return the frames that are due at `at_ns`: heartbeat, TIMESYNC, requests for streams and parameters."""

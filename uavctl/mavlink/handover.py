@@ -137,6 +137,11 @@ class HandoverStateMachine:
         return self.state in _MOVING_STATES
 
     @property
+    def lands_on_request(self) -> bool:
+        """Whether a request to land would be made in this state, or is made already."""
+        return TRANSITIONS[self.state, HandoverEvent.LAND][0] is HandoverState.LANDING
+
+    @property
     def is_finished(self) -> bool:
         """Whether nothing will be sent any more."""
         return self.state in _END_STATES and not self.is_relay_needed

@@ -14,6 +14,7 @@ from logs.recording.notes import RecorderNote
 from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
 from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
 from logs.recording.recover import recover
+from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.topics import Definition, is_view
 from logs.recording.views import ViewBuilder
 from uavctl.config.types import LogConfig
@@ -114,3 +115,44 @@ def test_who_watches_sees_each_message_once_in_order(tmp_path: Path) -> None:
     written = [(m.definition.topic, m.at_ns, m.data) for m in scan(path) if isinstance(m, RecordedMessage)]
     unnoted = [one for one in written if one[0] != "/uavctl/recorder"]
     assert seen == unnoted
+
+
+@pytest.mark.fault(87)
+@pytest.mark.parametrize("place", ["watch", "look"])
+def test_87_a_viewer_that_fails_costs_no_record(tmp_path: Path, place: str) -> None:
+    path, items = tmp_path / "flight.mcap", fly_view().entries[:120]
+
+    def fail(*arguments: object) -> None:
+        raise MemoryError
+
+    topics = DerivedTopics(ViewBuilder(), fail) if place == "watch" else DerivedTopics(ViewBuilder(), look=fail)
+    recorder = Recorder(path, derived_topics=topics)
+    for item in items:
+        recorder.put(*item)
+    status = recorder.close()
+    assert status.ok and status.unseen == len(items)
+    assert drop_recorder_notes(list(read(path))) == round_records(items)
+
+
+@pytest.mark.fault(87)
+def test_87_a_writing_thread_without_memory_for_a_moment_goes_on_and_counts_what_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, items = tmp_path / "flight.mcap", flight(60)
+    plain, calls = Segment.add, 0
+
+    def add(segment: Segment, entry: QueuedMessage) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 20:
+            raise MemoryError
+        plain(segment, entry)
+
+    monkeypatch.setattr(Segment, "add", add)
+    recorder = Recorder(path)
+    for item in items:
+        recorder.put(*item)
+    status = recorder.close()
+    assert not status.ok and status.dropped == 1
+    kept = drop_recorder_notes(list(read(path)))
+    assert len(kept) == len(items) - 1 and all(item in items for item in kept)

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from recording_fakes import HEADER, Clock, Disk, Item, drop_recorder_notes, flight
 
 from logs.recording.derived_topics import LOG
-from logs.recording.disk import DiskFile, FreeSpaceMonitor
+from logs.recording.disk import MAGIC, DiskFile, FreeSpaceMonitor
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import header, read, records, segment_files
@@ -83,6 +83,37 @@ def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -
     assert [one.file for one in found.segments] == list(found.files)
     assert sum(one.messages for one in found.segments) == status.written
     assert all(one.finished for one in found.segments)
+
+
+@pytest.mark.fault(93)
+@pytest.mark.parametrize("data", [b"", b"a note of somebody's", MAGIC])
+def test_93_a_name_that_somebody_has_taken_is_passed_over_without_a_loss(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "flight.mcap"
+    foreign_files = [path.with_name(f"flight-{number}.mcap") for number in (2, 3, 5)]
+    items = flight(300)
+    clock = Clock()
+    recorder = SyncRecorder(path, SMALL, clock=clock)
+    for file in foreign_files:
+        file.write_bytes(data)
+    fly(recorder, clock, items)
+    status = recorder.close()
+    assert status.ok and status.dropped == 0
+    assert {path.with_name(f"flight-{number}.mcap") for number in (4, 6)} <= set(segment_files(path))
+    assert not set(foreign_files) & set(segment_files(path))
+    assert drop_recorder_notes(list(read(path))) == items
+    assert [file.read_bytes() for file in foreign_files] == [data] * 3
+
+
+@pytest.mark.fault(93)
+def test_93_a_file_that_somebody_adds_to_a_whole_recording_is_no_part_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    items = flight(20)
+    clock = Clock()
+    recorder = SyncRecorder(path, clock=clock)
+    fly(recorder, clock, items)
+    recorder.close()
+    path.with_name("flight-2.mcap").touch()
+    assert segment_files(path) == (path,) and drop_recorder_notes(list(read(path))) == items
 
 
 def test_each_file_is_on_the_disk_before_the_next_is_begun(tmp_path: Path) -> None:

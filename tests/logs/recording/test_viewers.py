@@ -24,7 +24,7 @@ from uavctl.cli.app import run
 from uavctl.records import Decision, Estimate, Plan
 
 # What a flight without trouble never says.
-SILENT = {"/uavctl/library", "/uavctl/relay", "/uavctl/check", "/uavctl/parameter", "/uavctl/refused"}
+SILENT = {f"/uavctl/{name}" for name in ("library", "relay", "check", "parameter", "refused", "failure")}
 WELL_KNOWN = {"FrameTransforms", "FrameTransform", "PoseInFrame", "PosesInFrame", "Log", "SceneUpdate"}
 # What Rerun makes of a well-known message; of the others it shows the fields.
 DRAWN = {

@@ -1,0 +1,52 @@
+"""Signals that end a command: which are handled, what the second one does, what is as before afterwards."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from uavctl.cli.signals import DELIBERATE, END_LIMIT_S, stop_on_signals
+from uavctl.errors import EndedBySignal
+
+NAMES = ("HUP", "INT", "QUIT", "TERM", "USR1", "USR2", "ALRM", "VTALRM", "PROF", "XCPU", "IO", "PWR", "SYS", "TRAP")
+KILLING = [
+    *(signal.Signals[f"SIG{name}"] for name in NAMES),
+    *(number for number in signal.valid_signals() if number >= signal.SIGRTMIN),
+]
+
+
+@pytest.mark.fault(86)
+@pytest.mark.parametrize("number", KILLING)
+def test_each_signal_that_would_kill_asks_for_the_end(number: int) -> None:
+    before = signal.getsignal(number)
+    with stop_on_signals() as stopped:
+        assert not stopped()
+        signal.raise_signal(number)
+        assert stopped()
+        if number not in DELIBERATE:
+            signal.raise_signal(number)  # timers and closed terminals repeat theirs
+    assert signal.getsignal(number) == before
+
+
+@pytest.mark.fault(86)
+@pytest.mark.parametrize("number", sorted(DELIBERATE))
+def test_a_second_deliberate_signal_ends_the_command_and_sets_a_limit_for_that(number: int) -> None:
+    with pytest.raises(EndedBySignal) as raised, stop_on_signals():
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(number)
+    assert raised.value.code == 128 + number
+    assert 0 < signal.alarm(0) <= END_LIMIT_S
+    assert signal.getsignal(signal.SIGALRM) == signal.SIG_DFL
+
+
+@pytest.mark.fault(86)
+def test_an_ignored_signal_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
+    try:
+        with stop_on_signals() as stopped:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stopped()
+    finally:
+        signal.signal(signal.SIGHUP, before)

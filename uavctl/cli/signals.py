@@ -1,0 +1,77 @@
+"""Signals that end a command in order: each signal that would kill the process, as far as it can be handled."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from uavctl.errors import EndedBySignal
+
+SIGNAL_EXIT_BASE = 128  # exit codes of a process that a signal has ended are this much higher than its number
+# Sent on purpose by a person or a service manager. Only the second one of these ends the process at once: a closed
+# terminal sends SIGHUP twice, and limits and timers repeat their signals.
+DELIBERATE = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGQUIT})
+# Signals that do not kill, cannot be handled, or report a fault of the process itself.
+_EXCLUDED = frozenset(
+    {
+        signal.SIGKILL,
+        signal.SIGSTOP,
+        signal.SIGCHLD,
+        signal.SIGCONT,
+        signal.SIGTSTP,
+        signal.SIGTTIN,
+        signal.SIGTTOU,
+        signal.SIGURG,
+        signal.SIGWINCH,
+        signal.SIGSEGV,
+        signal.SIGBUS,
+        signal.SIGFPE,
+        signal.SIGILL,
+        signal.SIGABRT,
+    }
+)
+END_LIMIT_S = 10  # from the second signal to the end of the process; the recording closes within 5 s
+
+Handler = Callable[[int, FrameType | None], None]
+
+
+@contextmanager
+def handle_end_signals(handler: Handler) -> Iterator[None]:
+    """Call a function at each signal that would kill the process; ignored signals stay ignored, as under nohup."""
+    numbers = [
+        number
+        for number in signal.valid_signals() - _EXCLUDED
+        if number in DELIBERATE or signal.getsignal(number) is signal.SIG_DFL
+    ]
+    previous = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, signal.SIG_DFL if old is None else old)
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Callable[[], bool]]:
+    """Yield a function that says whether a signal has asked for the end.
+
+    A second deliberate signal raises in the main thread. The system ends the process if that takes too long.
+    """
+    stop_requested, deliberate_requested = threading.Event(), threading.Event()
+
+    def request_stop(number: int, frame: FrameType | None) -> None:
+        del frame
+        stop_requested.set()
+        if number not in DELIBERATE:
+            return
+        if deliberate_requested.is_set():
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.alarm(END_LIMIT_S)
+            raise EndedBySignal(SIGNAL_EXIT_BASE + number)
+        deliberate_requested.set()
+
+    with handle_end_signals(request_stop):
+        yield stop_requested.is_set
