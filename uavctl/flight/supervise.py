@@ -30,12 +30,21 @@ This is the only table from verdicts to actions. Phase 1 acts on those about sin
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import FilterView, TickContext, observe_motion, read_position, read_velocity, view_filter
-from uavctl.flight.estimator import FilterHistory, distrust_inertial, drop_samples, make_estimate, predict_ahead
+from uavctl.flight.estimator import (
+    FilterHistory,
+    distrust_inertial,
+    drop_samples,
+    make_estimate,
+    predict_ahead,
+    predict_belief,
+)
 from uavctl.flight.fallback import FallbackReason
 from uavctl.flight.kalman import Belief, read_capture_ns
 from uavctl.flight.limits import ZERO
@@ -44,7 +53,7 @@ from uavctl.flight.monitors import engaged, external, inertial, outside, vehicle
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import AnswerObservation, ExternalState, WallObservation
 from uavctl.flight.monitors.inertial import InertialObservation, Source
-from uavctl.flight.monitors.observation import MOTION_NS
+from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
@@ -162,12 +171,35 @@ def _drop_after(history: FilterHistory, dropped_after_ns: int) -> FilterHistory:
 
 
 def _judge_inertial(state: ControlState, view: FilterView, context: TickContext) -> Verdict:
-    """Judge inertial data that carry the estimate on without a position, as the monitor of changes found them."""
+    """Judge inertial data that carry the estimate on without a position."""
     belief, change = view.belief, state.monitors.engaged.velocity_change
-    if belief is None or change.inertial_wrong_ns is None:
+    if belief is None:
         return NO_VERDICT
-    comparison = InertialObservation(Source.VEHICLE_VELOCITY, False, context.at_ns, belief.captured_ns)
+    consistent = change.inertial_wrong_ns is None and not _has_drifted(state, belief, view, context)
+    comparison = InertialObservation(Source.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
     return inertial.update(belief.inertial, comparison)[1]
+
+
+def _has_drifted(state: ControlState, belief: Belief, view: FilterView, context: TickContext) -> bool:
+    """Whether a velocity by inertial data has drifted away from the vehicle's own, which changes alike and steadily."""
+    trust, motion, controller = belief.inertial, context.inputs.motion, context.controller
+    bounds, change = controller.envelope, state.monitors.engaged.velocity_change
+    if trust.distrusted_ns is not None or trust.used_ns is None or trust.used_ns <= belief.captured_ns:
+        return False
+    own = read_vehicle_velocity(motion, context.at_ns)
+    if bounds is None or own is None or motion is None or motion.velocity_ns is None or not change.samples:
+        return False
+    has_jumped = math.dist(own, change.samples[-1][1]) > bounds.disagreement_mps
+    if has_jumped or change.disagrees_ns is not None or change.velocity_wrong_ns is not None:
+        return False
+    # Both at the same time: the vehicle's velocity of a quarter of a second ago does not show how it moves now.
+    then = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns))
+    if then is None:
+        return False
+    observation = observe_velocity(
+        state, state.monitors.engaged, make_estimate(controller.kalman, then, with_cov=False), context
+    )
+    return observation is not None and not vehicle_velocity.is_inertial_consistent(observation)
 
 
 def observe_velocity(

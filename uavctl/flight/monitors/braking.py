@@ -41,9 +41,11 @@ def update(
         state = BrakingState(resumed_ns=motion.resumed_ns)
     if not tick.braking:
         return (state if state.began is None else BrakingState(resumed_ns=state.resumed_ns)), NO_VERDICT
-    velocity = read_vehicle_velocity(tick.motion, tick.at_ns) if believes_velocity else None
-    if velocity is None:
+    if not believes_velocity:
         return BrakingState(resumed_ns=state.resumed_ns), NO_VERDICT
+    velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
+    if velocity is None:
+        return state, NO_VERDICT
     speed_mps = math.hypot(*velocity)
     if state.began is None:
         return BrakingState((tick.at_ns, speed_mps), state.resumed_ns), NO_VERDICT

@@ -1,9 +1,10 @@
 """Monitor: may the vehicle's own velocity be believed? Does it contradict a prediction, or inertial data?
 
-1. It may be believed if positions agreed with it, or the predicted velocity is near it, or (in a flight's first ten
-   seconds) the velocity that setpoints gave is. Else: distrust the vehicle's velocity.
+1. It may be believed if inertial data change as it does (`uavctl.flight.monitors.velocity_change`), or positions agreed
+   with it, or the predicted velocity is near it, or (in a flight's first ten seconds) the velocity that setpoints gave
+   is. Else: distrust the vehicle's velocity.
 2. Without a position for two steps: a prediction far from it is wrong, and so is a plan of it. Then: brake.
-3. A velocity that inertial data carried on without a position is not near it. Then: distrust inertial data.
+3. A velocity that inertial data carried on without a position has drifted away from it. Then: distrust inertial data.
 
 These compare without a memory of their own, so each is a `judge(observation) -> Verdict`.
 

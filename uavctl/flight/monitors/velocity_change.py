@@ -129,7 +129,9 @@ def _believe_again(
     velocity_ns, inertial_ns = state.velocity_wrong_ns, state.inertial_wrong_ns
     if inertial_ns is not None and at_ns - inertial_ns > INERTIAL_DISTRUST_NS:
         state = replace(state, inertial_wrong_ns=None, samples=())
-    if velocity_ns is None or velocity.apart_mps is None or velocity.offsets[0][0] <= velocity_ns:
+    if velocity_ns is None or velocity.apart_mps is None:
+        return state
+    if not velocity.offsets or velocity.offsets[0][0] <= velocity_ns:
         return state
     if velocity.apart_mps <= parameters.disagreement_mps:
         state = replace(state, velocity_wrong_ns=None, samples=())

@@ -1,0 +1,142 @@
+"""The comparison of the vehicle's own velocity with its inertial data: which of them is wrong, and when that ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from envelope_rig import PARAMETERS, motion, seen
+from flight_rig import MS, START_NS
+from msgspec import structs
+
+from uavctl.flight.limits import ZERO
+from uavctl.flight.monitors.motion import Motion, TickObservation, update_motion
+from uavctl.flight.monitors.velocity import CORRECTS_NS, VelocityState
+from uavctl.flight.monitors.velocity_change import VelocityChangeState, update
+from uavctl.records import Vec3
+
+TICK_NS = 50 * MS
+ACCEL: Vec3 = (-1.5, 0.0, 0.0)
+SPEED_MPS = 4.0  # at first
+LAG_S = 1.5  # from then on the model's lag has no effect any more
+NO_POSITIONS, AT_FIRST, INITIAL = VelocityState(), Motion(), VelocityChangeState()
+
+
+def north(value: float) -> Vec3:
+    return (value, 0.0, 0.0)
+
+
+def fly(
+    ticks: int,
+    own: Callable[[float, float], float],
+    inertial: Callable[[float, float], float | None],
+    *,
+    velocity: VelocityState = NO_POSITIONS,
+    motion_state: Motion = AT_FIRST,
+    state: VelocityChangeState = INITIAL,
+) -> list[VelocityChangeState]:
+    """Brake with ACCEL; `own` and `inertial` get the time and the true value, and return what is sent."""
+    states = []
+    for tick in range(ticks):
+        at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
+        shown = inertial(s, ACCEL[0])
+        observation = structs.replace(
+            seen(at_ns, sent=ACCEL, vehicle_motion=motion(north(own(s, SPEED_MPS + s * ACCEL[0])), at_ns)),
+            inertial_mps2=None if shown is None else north(shown),
+        )
+        motion_state = update_motion(motion_state, observation, PARAMETERS)
+        state = update(state, TickObservation(observation, motion_state, PARAMETERS), velocity)
+        states.append(state)
+    return states
+
+
+def true(_s: float, value: float) -> float:
+    return value
+
+
+def is_found(state: VelocityChangeState) -> tuple[bool, bool]:
+    return state.velocity_wrong_ns is not None, state.inertial_wrong_ns is not None
+
+
+def test_true_ones_agree_and_support_the_velocity() -> None:
+    states = fly(40, true, true)
+    assert {is_found(state) for state in states} == {(False, False)}
+    last_ns = START_NS + 39 * TICK_NS
+    assert states[-1].supports_velocity(last_ns) and not states[-1].supports_velocity(last_ns + 301 * MS)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("begin_s", [LAG_S, LAG_S + 0.4])
+@pytest.mark.parametrize(
+    ("lie", "within_s"),
+    [
+        (lambda _s, v: -v, 0.15),
+        (lambda _s, v: 0.3 * v, 0.15),
+        (lambda _s, v: v + 0.9, 0.15),
+        (lambda s, v: v + 1.5 * (s - LAG_S), 0.7),  # as of a velocity that does not change any more
+    ],
+)
+def test_a_wrong_velocity_is_found(lie: Callable[[float, float], float], within_s: float, begin_s: float) -> None:
+    states = fly(60, lambda s, v: lie(s, v) if s >= begin_s else v, true)
+    found = [round(tick * 0.05, 2) for tick, state in enumerate(states) if is_found(state) == (True, False)]
+    assert found and begin_s < found[0] <= begin_s + within_s
+    assert is_found(states[-1]) == (True, False) and not states[-1].supports_velocity(START_NS + 59 * TICK_NS)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("lie", [lambda a: -a, lambda a: 0.3 * a, lambda _a: 0.0])
+def test_wrong_inertial_data_are_found(lie: Callable[[float], float]) -> None:
+    states = fly(60, true, lambda s, a: lie(a) if s >= LAG_S else a)
+    assert is_found(states[-1]) == (False, True)
+
+
+@pytest.mark.fault(94)
+def test_both_are_wrong_where_neither_changes_as_gusts_allow() -> None:
+    states = fly(60, lambda s, v: v + 8.0 if s >= LAG_S else v, lambda s, a: -50.0 if s >= LAG_S else a)
+    assert is_found(states[-1]) == (True, True)
+
+
+@pytest.mark.fault(94)
+def test_a_velocity_that_repeats_is_found_without_inertial_data_but_not_at_rest() -> None:
+    frozen = fly(40, lambda _s, _v: 1.25, lambda _s, _a: None)
+    assert is_found(frozen[-1]) == (True, False)
+    moving = fly(40, true, lambda _s, _a: None)
+    assert is_found(moving[-1]) == (False, False)
+
+
+def test_nothing_is_compared_while_positions_correct_the_velocity() -> None:
+    resumed = Motion(resumed_ns=START_NS)
+    states = fly(30, lambda s, v: v + (0.9 if s > 0.2 else 0.0), true, motion_state=resumed)
+    count = CORRECTS_NS // TICK_NS
+    assert all(state.samples == () for state in states[:count]) and len(states[count].samples) == 1
+
+
+def test_inertial_data_are_compared_again_after_three_seconds() -> None:
+    wrong = VelocityChangeState(inertial_wrong_ns=START_NS)
+    states = fly(80, true, true, state=wrong)
+    ends = [tick * TICK_NS for tick, state in enumerate(states) if state.inertial_wrong_ns is None]
+    assert ends[0] == 3_000_000_000 + TICK_NS
+
+
+@pytest.mark.parametrize(
+    ("offset_ns", "apart_mps", "is_wrong"), [(1, 0.0, False), (0, 0.0, True), (1, None, True), (1, 0.9, True)]
+)
+def test_a_velocity_is_believed_again_once_positions_since_then_agree(
+    offset_ns: int, apart_mps: float | None, is_wrong: bool
+) -> None:
+    positions = VelocityState(offsets=((START_NS + offset_ns, ZERO),), apart_mps=apart_mps)
+    (state,) = fly(1, true, true, state=VelocityChangeState(velocity_wrong_ns=START_NS), velocity=positions)
+    assert (state.velocity_wrong_ns is not None) == is_wrong
+
+
+def test_an_old_own_velocity_is_no_sample() -> None:
+    observation = structs.replace(
+        seen(START_NS + 400 * MS, sent=ACCEL, vehicle_motion=motion(north(1.0), START_NS)), inertial_mps2=ACCEL
+    )
+    before = VelocityChangeState(samples=((START_NS, north(1.0), ZERO, ZERO),), disagrees_ns=START_NS)
+    after = update(
+        before,
+        TickObservation(observation, update_motion(Motion(), observation, PARAMETERS), PARAMETERS),
+        VelocityState(),
+    )
+    assert (after.samples, after.disagrees_ns) == ((), None)
