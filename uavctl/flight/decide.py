@@ -21,7 +21,14 @@ from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import make_estimate, select_covariance
-from uavctl.flight.fallback import Fallback, FallbackReason, advance_fallback, begin_fallback, request_fallback
+from uavctl.flight.fallback import (
+    Fallback,
+    FallbackReason,
+    advance_fallback,
+    begin_fallback,
+    request_fallback,
+    restart_hold,
+)
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
@@ -205,7 +212,9 @@ def _decide_plan(begun: Decided, phase: _Phase) -> Decided:
     resumed_ns = phase.supervised.monitors.engaged.motion.resumed_ns
     if begun.fallback is not None and resumed_ns is not None and at_ns - resumed_ns < REENGAGE_NS:
         reason = "positions have come back, and their first second is compared"
-        return _fall_back(begun, begun.fallback, phase, reason)
+        is_fresh = begun.consecutive_samples >= wanted
+        fallback = restart_hold(begun.fallback, at_ns) if is_fresh else begun.fallback
+        return _fall_back(begun, fallback, phase, reason)
     if begun.fallback is not None and begun.consecutive_samples < wanted:
         reason = f"{begun.consecutive_samples} of {wanted} fresh samples in a row"
         return _fall_back(begun, begun.fallback, phase, reason)

@@ -97,6 +97,11 @@ def request_fallback(fallback: Fallback | None, reason: FallbackReason, at_ns: i
     return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns, reason=reason)
 
 
+def restart_hold(fallback: Fallback, at_ns: int) -> Fallback:
+    """Let the time to hold begin again: positions are back, and are compared before plans fly again."""
+    return fallback if fallback.held_ns is None else replace(fallback, held_ns=at_ns)
+
+
 def advance_fallback(
     fallback: Fallback,
     at_ns: int,

@@ -53,7 +53,7 @@ from uavctl.flight.monitors import engaged, external, inertial, outside, vehicle
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import AnswerObservation, ExternalState, WallObservation
 from uavctl.flight.monitors.inertial import InertialObservation, Source
-from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
+from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
@@ -64,6 +64,9 @@ from uavctl.records import ControlMode, Estimate, Order
 POSITION_CODES = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
 ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING})
 
+# Without positions and inertial data for so long, a plan is not flown on. A gust makes inertial data implausible for a
+# shorter time, and a burst of losses is shorter.
+LOST_NS = 400_000_000
 PLAYED_OUT_STEPS = 2  # without a position: from there on a prediction is compared with the vehicle's own velocity
 REPLAN_STEPS = 3  # for which a plan is made anew once positions were dropped: the setpoint is slew-limited
 
@@ -187,9 +190,9 @@ def _has_drifted(state: ControlState, belief: Belief, view: FilterView, context:
     if trust.distrusted_ns is not None or trust.used_ns is None or trust.used_ns <= belief.captured_ns:
         return False
     own = read_vehicle_velocity(motion, context.at_ns)
-    if bounds is None or own is None or motion is None or motion.velocity_ns is None or not change.samples:
+    if bounds is None or own is None or motion is None or motion.velocity_ns is None:
         return False
-    has_jumped = math.dist(own, change.samples[-1][1]) > bounds.disagreement_mps
+    has_jumped = bool(change.samples) and math.dist(own, change.samples[-1][1]) > bounds.disagreement_mps
     if has_jumped or change.disagrees_ns is not None or change.velocity_wrong_ns is not None:
         return False
     # Both at the same time: the vehicle's velocity of a quarter of a second ago does not show how it moves now.
@@ -305,8 +308,9 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
     change, trust = monitors.velocity_change, view.belief.inertial
     if change.velocity_wrong_ns is not None or change.inertial_wrong_ns is not None:
         return _CONTRADICTED
-    is_lost = trust.distrusted_ns is not None or context.at_ns - (trust.used_ns or context.at_ns) > MOTION_NS
-    return _CARRIED_BY_NOTHING if is_lost else NO_VERDICT
+    is_lost = trust.distrusted_ns is not None or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
+    is_silent = context.at_ns - view.belief.captured_ns > LOST_NS
+    return _CARRIED_BY_NOTHING if is_silent and is_lost else NO_VERDICT
 
 
 def _is_likely(track: OutlierTrack | None) -> bool:
