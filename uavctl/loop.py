@@ -40,9 +40,9 @@ from uavctl.records import (
     Decision,
     Ending,
     Event,
-    Failure,
-    FailureEffect,
     InertialSample,
+    InternalError,
+    InternalErrorEffect,
     Order,
     Outgoing,
     PositionSample,
@@ -410,29 +410,29 @@ class ControlLoop:
     def fail(self, error: Exception, at_ns: int) -> Event:
         """Note an error of a whole cycle, and return its event: no setpoint is sent, landing is asked for."""
         return self.handle_failure(
-            Failure(at_ns=at_ns, text=_describe_error(error), effect=FailureEffect.CONTROL), discard
+            InternalError(at_ns=at_ns, text=_describe_error(error), effect=InternalErrorEffect.CONTROL), discard
         )
 
     def note_error(self, subject: str, error: Exception, at_ns: int) -> Event:
         """Note an error of what the flight does not need; return the event."""
         text = f"{subject}: {_describe_error(error)}; the flight goes on"
-        return self.handle_failure(Failure(at_ns=at_ns, text=text, effect=FailureEffect.NONE), discard)
+        return self.handle_failure(InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.NONE), discard)
 
     def send_landing_request(self, at_ns: int, send: Send) -> bool:
         """Send the landing request of a flight whose cycles fail, if it is due; return whether it is pending."""
         self._begin_landing_request(at_ns)
         if self._landing_request.is_due(at_ns):
             text = "no cycle works any more: landing is asked for"
-            self.handle_failure(Failure(at_ns=at_ns, text=text, effect=FailureEffect.LANDING), send)
+            self.handle_failure(InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.LANDING), send)
         return self._landing_request.is_pending
 
-    def handle_failure(self, failure: Failure, send: Send) -> Event:
+    def handle_failure(self, failure: InternalError, send: Send) -> Event:
         """Handle an error outside the loop; return its event."""
         self._put("/uavctl/failure", failure.at_ns, failure)
-        if failure.effect is FailureEffect.CONTROL:
+        if failure.effect is InternalErrorEffect.CONTROL:
             return self._fail(failure.text, failure.at_ns)
         event = self._make_error_event(failure.text, failure.at_ns)
-        if failure.effect is FailureEffect.LANDING:
+        if failure.effect is InternalErrorEffect.LANDING:
             self._send_landing_request(failure.at_ns, send)
         return event
 

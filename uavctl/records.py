@@ -291,7 +291,7 @@ class Refused(Record, frozen=True, kw_only=True):
     counts: dict[str, int]  # reason -> count
 
 
-class FailureEffect(StrEnum):
+class InternalErrorEffect(StrEnum):
     """Effect of an error on a flight."""
 
     NONE = "none"  # the flight goes on
@@ -299,12 +299,12 @@ class FailureEffect(StrEnum):
     LANDING = "landing"  # a landing request is sent without the hand-over
 
 
-class Failure(Record, frozen=True, kw_only=True):
+class InternalError(Record, frozen=True, kw_only=True):
     """Error outside the control loop, as the loop is told; an input, for a replay."""
 
     at_ns: int
     text: str
-    effect: FailureEffect
+    effect: InternalErrorEffect
 
 
 class Checked(Record, frozen=True, kw_only=True):

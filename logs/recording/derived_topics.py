@@ -27,8 +27,6 @@ from uavctl.records import Decision, Estimate, LinkStats, Matrix, Plan, Record, 
 
 PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
 
-# What people plot, as flat records; NaN where there is no number, which a plot shows as a gap.
-
 
 class Axes(Record, frozen=True, kw_only=True):
     """One number for each axis of local NED; NaN for an axis that the plant does not have."""
@@ -265,12 +263,6 @@ def replace_missing(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-# Protobuf messages of records of plain numbers: one definition, the record type, gives both.
-#
-# The descriptor is built here, so that nothing has to be compiled. Fields are numbered in the order
-# in which the type has them.
-
-
 _PACKAGE = "uavctl"
 _SCALARS: Mapping[object, FieldDescriptorProto.Type.ValueType] = {
     float: FieldDescriptorProto.TYPE_DOUBLE,
@@ -331,9 +323,6 @@ def _describe(message: DescriptorProto, kind: type[msgspec.Struct], scope: str) 
                 _describe(message.nested_type.add(), part, scope)
         else:
             raise TypeError(f"{kind.__name__}.{field.name}: no protobuf field for {field.type}")
-
-
-# Topics that are made from the records for viewers: one row each. A replay and our own pages never read them.
 
 
 FRAMES, VEHICLE_FRAME = "/view/frames", "/view/vehicle_frame"

@@ -16,8 +16,6 @@ from uavctl.errors import RecordingError, UsageError
 
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a recording
 
-# What kind of recording a file is: by its first bytes where they tell, else by its name, in whatever case.
-
 
 ULOG_MAGIC = b"ULog\x01\x12\x35"
 _STAMP_BYTES = 8  # of a `.tlog`, before each packet
@@ -85,9 +83,6 @@ def _read_head(path: Path) -> bytes:
             return file.read(_HEAD_BYTES)
     except OSError:
         return b""  # told by who reads it
-
-
-# Files that are written.
 
 
 class OutputFile(Protocol):
@@ -232,9 +227,6 @@ def check_free_space(path: Path, free_bytes: int) -> int:
     return free
 
 
-# Folders and files that a run makes, and takes away again where nothing came of it; what was there before stays.
-
-
 @contextmanager
 def remove_empty_folders(files: Iterable[Path]) -> Iterator[None]:
     """Remove in the end the folders that were made within this block and are empty."""
@@ -267,9 +259,6 @@ def _exists(path: Path) -> bool:
         return path.exists()
     except OSError:
         return True
-
-
-# Files that are there whole, and all of them, or not at all.
 
 
 _UNFINISHED = ".part"

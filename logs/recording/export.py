@@ -235,11 +235,6 @@ class Tables:
         return self._tables[name]
 
 
-# A recording as tables: CSV, or Parquet with the extra `parquet`.
-#
-# One file for each topic of records (and one for each list of records within); what was made for viewers is left out.
-
-
 _BATCH_ROWS = 4096  # kept in memory for each Parquet table
 CSV_ENCODING = "utf-8"
 
@@ -450,9 +445,6 @@ def _write_parquet(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Wr
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         yield write
         flush()
-
-
-# One table of a recording, in memory.
 
 
 def list_tables(flight: Path) -> tuple[str, ...]:

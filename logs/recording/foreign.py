@@ -43,15 +43,6 @@ from logs.recording.ulog import is_ulog, read_ulog
 from uavctl.errors import RecordingError, UsageError
 from uavctl.mavlink.framing import is_frame
 
-# Messages of ROS read by the definition that their recording brings along, as far as it takes to unwrap MAVLink.
-#
-# Layout of ROS 1: http://wiki.ros.org/msg#Fields, little-endian without gaps. ROS 2: CDR, each number aligned to its
-# size, after 4 bytes that tell the byte order (https://www.omg.org/spec/DDSI-RTPS/2.5, 10.2).
-#
-# Read here, not by mcap-ros1-support, whose genpy makes Python source of a definition and imports it: a file that a
-# stranger sends must run nothing. The tests hold both libraries beside this reader.
-
-
 ROS1, ROS2 = "ros1", "cdr"  # encodings of messages
 _DEFINITIONS = {ROS1: "ros1msg", ROS2: "ros2msg"}  # and of their schemas
 _NUMBERS = {
@@ -274,9 +265,6 @@ def _to_list(fields: Mapping[str, Value], name: str) -> list[Value]:
     if not isinstance(value, list):
         raise UnreadableError(f"it has no list {name}")
     return value
-
-
-# Frames out of a stream of bytes that somebody recorded piece by piece, cut anywhere.
 
 
 @dataclass(frozen=True)
@@ -658,9 +646,6 @@ def _format_names(names: list[str]) -> str:
         return "it has no topic at all"
     more = f", and {len(names) - _MAX_NAMED_CHANNELS} more" if len(names) > _MAX_NAMED_CHANNELS else ""
     return f"it has: {', '.join(names[:_MAX_NAMED_CHANNELS])}{more}"
-
-
-# Any recording of another program, by its kind.
 
 
 def read_foreign_packets(path: Path, topics: Sequence[str] = ()) -> Tlog | None:

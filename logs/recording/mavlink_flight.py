@@ -506,9 +506,6 @@ def _velocity(position: Position) -> Vec3 | None:
     return None if position.velocity_mps is None else _ned(position, position.velocity_mps)
 
 
-# The figures in words.
-
-
 def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     """Return names and values for a table, on a page or in a terminal."""
     yield "recording", info.recording

@@ -42,9 +42,6 @@ from logs.recording.topics import (
 from uavctl.errors import RecordingError
 from uavctl.records import Header, Record
 
-# Messages of a chunk, and whether they follow each other without a gap.
-
-
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _IS_MESSAGE = int(Opcode.MESSAGE)  # a plain number: compared for every record
 
@@ -520,11 +517,6 @@ def _is_torn(data: Buffer) -> bool:
     if at < 0:
         return True
     return data[at + _FOOTER.size :] != MAGIC and _RECORD.unpack_from(data, at) != (Opcode.FOOTER, 20)
-
-
-# Reader of recordings: all segments as one, in file order, nothing without its checksum.
-#
-# A file that was not finished is read to its last whole chunk; a damaged one is refused.
 
 
 R = TypeVar("R", bound=Record)

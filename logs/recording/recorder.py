@@ -28,9 +28,6 @@ from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError, need
 from uavctl.records import Datagram, Header, Record
 
-# What a recording carries for those who look on: messages for viewers beside each record, and a live view's share.
-
-
 Watcher = Callable[[Definition, int, bytes], None]
 
 
@@ -360,12 +357,6 @@ class WriteQueue:
             self._files.fail(error)
 
 
-# The topics of a flight served to a viewer while it lasts: Foxglove's WebSocket protocol, on this machine only.
-#
-# It is fed where recordings are written. The server keeps the newest `BACKLOG` messages for each viewer
-# and drops the oldest, so a viewer that does not read costs memory up to that, and no time.
-
-
 HOST = "127.0.0.1"
 BACKLOG = 1024  # messages: about four seconds of a flight
 STOP_S = 1.0  # for viewers to take their leave
@@ -423,9 +414,6 @@ def _make_watcher(foxglove: ModuleType, context: object) -> Watcher:
         logs[definition.topic](data, log_time=at_ns)
 
     return watch
-
-
-# Recorders: sinks that never block the control loop and never raise into it, whatever the disk does.
 
 
 POLL_S = 0.02

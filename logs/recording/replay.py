@@ -34,7 +34,7 @@ from uavctl.records import (
     Datagram,
     Decision,
     Event,
-    Failure,
+    InternalError,
     Plan,
     PositionSample,
     Record,
@@ -44,9 +44,6 @@ from uavctl.records import (
     discard,
 )
 from uavctl.smpc.plant import AXES, Plant
-
-# Where a replay parts from its recording: the field, what the tick knew, and how the difference goes on.
-
 
 DECISION = "/uavctl/decision"
 PLAN = "/uavctl/plan"
@@ -487,7 +484,7 @@ def replay(
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):
             loop.refused(record.link, record.counts, record.at_ns)
-        elif isinstance(record, Failure):
+        elif isinstance(record, InternalError):
             loop.handle_failure(record, discard)
         elif isinstance(record, RecorderNote):
             findings.dropped = record.dropped
@@ -526,6 +523,8 @@ def _is_input(topic: str) -> bool:
     """Return whether a topic is not compared: its records drive the loop, or the result reports them."""
     link = parse_raw_topic(topic)
     try:
-        return get_record_type(topic) in (StepInput, Refused, Failure, RecorderNote) if link is None else not link[1]
+        return (
+            get_record_type(topic) in (StepInput, Refused, InternalError, RecorderNote) if link is None else not link[1]
+        )
     except KeyError:
         return True  # decoding says that nobody knows it

@@ -358,12 +358,6 @@ def _library() -> str:
     return f"uavctl mcap-records-{version('mcap')}"
 
 
-# A recording's files, one after the other: when the next one is begun, and what goes over to it.
-#
-# A file that has grown to its size is closed and the next one begun (name-2.mcap ...). So it is after a failed write,
-# as well as possible and once the disk takes it; what the failed chunk held goes to the next file.
-
-
 MAX_TAKEN_NAMES = 100  # that somebody else has taken, passed over at a time
 RETRY_S = 1.0  # between tries to begin a file after a failed write
 

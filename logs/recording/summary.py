@@ -25,9 +25,6 @@ from uavctl.errors import ConfigError
 from uavctl.number_text import format_duration, format_number, format_percent_above
 from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector
 
-# How a recorded flight ended: the daemon's own last word, or what its records tell where there is none.
-
-
 _LANDED = frozenset({Cause.FALLBACK_LANDED, Cause.LANDED_AS_ORDERED, Cause.LANDED_AFTER_MISSION})
 _IN_FLIGHT = {
     ControlMode.BRAKE: "the recording ends while the fallback was braking",
@@ -88,9 +85,6 @@ def _format_seconds(flight: FlightData, at_ns: int) -> str:
     return f"{format_number(float(flight.seconds([at_ns])[0]))} s"
 
 
-# The limits of the state over a flight: constant ones, and fences that closed in.
-
-
 def compute_limits(flight: FlightData, t_s: Array) -> Array:
     """Return the right sides of the state set's rows (n, m_x) at report times (n,) [s]."""
     design, begun_s = flight.design, flight.targets[0][0]
@@ -126,9 +120,6 @@ def _read_fences(flight: FlightData) -> Iterator[FenceConfig]:
         yield from msgspec.convert(fences, tuple[FenceConfig, ...])
     except (ConfigError, msgspec.ValidationError):
         return
-
-
-# What a flight came to: the figures that people and scripts look at.
 
 
 RELATIVE_TOLERANCE = 1e-9

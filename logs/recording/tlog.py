@@ -27,9 +27,6 @@ from uavctl.mavlink.connection import STREAM_SCHEMES
 from uavctl.mavlink.framing import is_frame
 from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, discard
 
-# The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
-
-
 # Clocks are set by hand, by a GPS or by a server; what is no more than this is order, or a silence.
 FARTHEST_BACK_NS = 1_000_000_000
 LONGEST_SILENCE_NS = 3600 * 1_000_000_000
@@ -115,9 +112,6 @@ class MonotonicClock:
             if -FARTHEST_BACK_NS <= stamp_ns + offset_ns - self._last_ns <= LONGEST_SILENCE_NS:
                 return offset_ns
         return None
-
-
-# Reader of `.tlog` files: 8 bytes of big-endian microseconds since the epoch before each packet.
 
 
 GROUND_SYSTEMS = frozenset({245, 255})  # our own system id, and that of ground stations
@@ -293,9 +287,6 @@ def sort_packets(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
     return tuple(sorted(packets, key=lambda packet: packet.at_ns))
 
 
-# The raw MAVLink of a recording as a `.tlog`: each packet after 8 bytes of big-endian microseconds since the epoch.
-
-
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _HEAD_BYTES = 3  # of a packet: enough to know its length
 _OUT_OF_ORDER_NS = 1_000_000_000  # packets are put in order of time over such a span
@@ -437,9 +428,6 @@ def _find_streams(first: Header) -> frozenset[str]:
     except ConfigError:
         return frozenset()
     return frozenset(name for name, url in urls.items() if isinstance(url, str) and url.startswith(STREAM_SCHEMES))
-
-
-# A foreign flight as input: a `.tlog` through parser, clock offset, estimator and controller.
 
 
 class DelayQuantiles(msgspec.Struct, frozen=True, kw_only=True):

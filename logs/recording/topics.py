@@ -32,8 +32,8 @@ from uavctl.records import (
     Ending,
     Estimate,
     Event,
-    Failure,
     Header,
+    InternalError,
     LinkEstimate,
     LinkStats,
     Matrix,
@@ -107,7 +107,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/timing", Timing, "lateness and run time of a tick, measured by the shell"),
     Topic("/uavctl/check", Checked, "what the check before arming found, one record an item"),
     Topic(PARAMETER, ToldParameter, "a parameter that the vehicle told in the check before arming, one record each"),
-    Topic("/uavctl/failure", Failure, "an error outside the control loop, and its effect on the flight"),
+    Topic("/uavctl/failure", InternalError, "an error outside the control loop, and its effect on the flight"),
     Topic("/uavctl/refused", Refused, "what a connection dropped unread (address, rate, signature), once a second"),
     Topic("/uavctl/link", LinkStats, "counters of a connection, once a second"),
     Topic("/uavctl/relay", RelayStats, "positions that were passed on to the vehicle, once a second, if any are"),
@@ -176,14 +176,6 @@ def _make_any_schema(kind: type) -> dict[str, object]:
     if kind is object:
         return {"description": "any JSON value"}
     raise NotImplementedError(kind)
-
-
-# Records as exact JSON.
-#
-# Array keep every bit: shortest digits that round-trip, the sign of zero included. JSON has no NaN
-# and no infinity (msgspec would write null, which reads back as "missing"), so these are the strings
-# "NaN", "Infinity" and "-Infinity", read back as floats wherever the record's type has a float. Where
-# it has any value at all (`Header.design`) they stay strings.
 
 
 _MAX_TIME_NS = 2**64 - 1

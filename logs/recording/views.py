@@ -52,8 +52,6 @@ from uavctl.records import (
     VehicleStatus,
 )
 
-# Many parts of a message that differ by their numbers alone: made by filling in the bytes of one of them.
-
 
 class RepeatedField:
     """Bytes of a repeated field, to be merged into the message that has it.
@@ -308,11 +306,6 @@ _SPHERES = RepeatedField(
     ),
     6,
 )
-
-
-# Makes the topics for viewers from the records of a flight, as they come.
-#
-# It runs where recordings are written, never in the control thread.
 
 
 STILL_NS = 5_000_000_000  # what does not move is told again: for viewers that come late, and files begun later

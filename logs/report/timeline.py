@@ -127,7 +127,7 @@ def make_lanes(flight: FlightData) -> Iterator[Lane]:
             flight,
             "limited",
             "plan",
-            "a setpoint that the setpoint limiter changed",
+            "a setpoint that the limiter changed",
             (s for s in flight.setpoints if s.limited),
         ),
         Lane(

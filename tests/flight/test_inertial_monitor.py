@@ -10,9 +10,9 @@ import pytest
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.inertial import (
     UNUSED,
+    ComparedSource,
     InertialObservation,
     InertialTrust,
-    Source,
     is_consistent,
     is_plausible,
     update,
@@ -23,7 +23,9 @@ S = 1_000_000_000
 SINCE_NS = 5 * S
 
 
-def compare(trust: InertialTrust, source: Source, agrees: bool, at_ns: int, captured_ns: int = 0) -> InertialTrust:
+def compare(
+    trust: InertialTrust, source: ComparedSource, agrees: bool, at_ns: int, captured_ns: int = 0
+) -> InertialTrust:
     """The state after a comparison; a verdict comes if and only if distrust begins."""
     after, verdict = update(trust, InertialObservation(source, agrees, at_ns, captured_ns))
     begins = trust.distrusted_ns is None and after.distrusted_ns is not None
@@ -37,12 +39,12 @@ def compare(trust: InertialTrust, source: Source, agrees: bool, at_ns: int, capt
 def test_three_readings_in_a_row_that_the_model_refuses_are_distrusted() -> None:
     trust = UNUSED
     for at_ns, agrees in enumerate((True, False, False, True, False, False), start=1):
-        trust = compare(trust, Source.MODEL, agrees, at_ns)
+        trust = compare(trust, ComparedSource.MODEL, agrees, at_ns)
     assert (trust.used_ns, trust.refused, trust.distrusted_ns) == (4, 2, None)
-    assert compare(trust, Source.MODEL, False, 7).distrusted_ns == 7
+    assert compare(trust, ComparedSource.MODEL, False, 7).distrusted_ns == 7
 
 
-@pytest.mark.parametrize("source", [Source.POSITION, Source.VEHICLE_VELOCITY])
+@pytest.mark.parametrize("source", [ComparedSource.POSITION, ComparedSource.VEHICLE_VELOCITY])
 @pytest.mark.parametrize(
     ("used_ns", "captured_ns", "agrees", "distrusted"),
     [
@@ -53,7 +55,7 @@ def test_three_readings_in_a_row_that_the_model_refuses_are_distrusted() -> None
     ],
 )
 def test_inertial_data_are_distrusted_if_they_carried_the_estimate_somewhere_else(
-    source: Source, used_ns: int | None, captured_ns: int, agrees: bool, distrusted: bool
+    source: ComparedSource, used_ns: int | None, captured_ns: int, agrees: bool, distrusted: bool
 ) -> None:
     trust = InertialTrust(used_ns=used_ns, refused=1)
     after = compare(trust, source, agrees, 9, captured_ns)
@@ -63,16 +65,16 @@ def test_inertial_data_are_distrusted_if_they_carried_the_estimate_somewhere_els
 @pytest.mark.parametrize(
     ("source", "agrees", "after_ns", "age_ns", "ends"),
     [
-        (Source.POSITION, True, 3 * S, S, True),
-        (Source.POSITION, True, 3 * S - 1, S, False),
-        (Source.POSITION, True, 9 * S, S + 1, False),  # after a silence nearly every position agrees
-        (Source.POSITION, False, 9 * S, S, False),
-        (Source.MODEL, True, 9 * S, S, False),
-        (Source.VEHICLE_VELOCITY, True, 9 * S, S, False),
+        (ComparedSource.POSITION, True, 3 * S, S, True),
+        (ComparedSource.POSITION, True, 3 * S - 1, S, False),
+        (ComparedSource.POSITION, True, 9 * S, S + 1, False),  # after a silence nearly every position agrees
+        (ComparedSource.POSITION, False, 9 * S, S, False),
+        (ComparedSource.MODEL, True, 9 * S, S, False),
+        (ComparedSource.VEHICLE_VELOCITY, True, 9 * S, S, False),
     ],
 )
 def test_only_a_position_that_agrees_ends_distrust_and_no_sooner_than_three_seconds(
-    source: Source, agrees: bool, after_ns: int, age_ns: int, ends: bool
+    source: ComparedSource, agrees: bool, after_ns: int, age_ns: int, ends: bool
 ) -> None:
     trust = InertialTrust(used_ns=7, refused=3, distrusted_ns=SINCE_NS)
     at_ns = SINCE_NS + after_ns

@@ -59,7 +59,7 @@ def locate_on_grid(
     """Find the place of a tick on the grid."""
     # k = n div (Δt / tick)
     step, into = divmod(inputs.tick, controller.ticks_per_step)
-    mode, unready, vehicle = state.mode, describe_not_ready(inputs.vehicle), inputs.vehicle
+    mode, not_ready_reason, vehicle = state.mode, describe_not_ready(inputs.vehicle), inputs.vehicle
     return TickContext(
         inputs=inputs,
         controller=controller,
@@ -69,8 +69,8 @@ def locate_on_grid(
         is_boundary=state.plan.decided_step is None or step > state.plan.decided_step,
         mode=mode,
         was_in_control=mode not in _NOT_FLOWN,
-        not_ready_reason=unready,
-        is_controllable=vehicle is not None and not unready and not vehicle.landed and not vehicle.own_climb,
+        not_ready_reason=not_ready_reason,
+        is_controllable=vehicle is not None and not not_ready_reason and not vehicle.landed and not vehicle.own_climb,
     )
 
 

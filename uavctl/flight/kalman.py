@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from uavctl.arrays import Array
 from uavctl.flight.limits import AXES
 from uavctl.flight.monitors import inertial
-from uavctl.flight.monitors.inertial import UNUSED, InertialObservation, InertialTrust, Source
+from uavctl.flight.monitors.inertial import UNUSED, ComparedSource, InertialObservation, InertialTrust
 from uavctl.flight.propagation import Propagation, make_propagation
 from uavctl.records import PositionSample, Vec3
 from uavctl.smpc.estimate import add_bias, add_gauss_markov, force_jump
@@ -287,7 +287,7 @@ def is_consistent(kalman: Kalman, belief: Belief, values: Array, variances: Arra
 def _judge_inertial(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> Belief:
     """Compare a belief with a sample: inertial data are distrusted, or are not any more."""
     consistent = is_consistent(kalman, belief, values, variances)
-    observation = InertialObservation(Source.POSITION, consistent, belief.at_ns, belief.captured_ns)
+    observation = InertialObservation(ComparedSource.POSITION, consistent, belief.at_ns, belief.captured_ns)
     trust, verdict = inertial.update(belief.inertial, observation)
     if trust is belief.inertial:
         return belief
@@ -327,7 +327,7 @@ def update_with_inertial(kalman: Kalman, belief: Belief, accel_mps2: Array, u: A
     ph = cov.dot(of_z.T)
     spread = of_z.dot(ph) + noise
     plausible = inertial.is_plausible(innovation.tolist(), spread.diagonal().tolist())
-    observation = InertialObservation(Source.MODEL, plausible, belief.at_ns, belief.captured_ns)
+    observation = InertialObservation(ComparedSource.MODEL, plausible, belief.at_ns, belief.captured_ns)
     trust, _ = inertial.update(belief.inertial, observation)
     if not plausible:
         return replace(belief, inertial=trust)

@@ -52,7 +52,7 @@ from uavctl.flight.measure import Measured
 from uavctl.flight.monitors import engaged, external, inertial, outside, vehicle_velocity
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import AnswerObservation, ExternalState, WallObservation
-from uavctl.flight.monitors.inertial import InertialObservation, Source
+from uavctl.flight.monitors.inertial import ComparedSource, InertialObservation
 from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
@@ -179,7 +179,7 @@ def _judge_inertial(state: ControlState, view: FilterView, context: TickContext)
     if belief is None:
         return NO_VERDICT
     consistent = change.inertial_wrong_ns is None and not _has_drifted(state, belief, view, context)
-    comparison = InertialObservation(Source.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
+    comparison = InertialObservation(ComparedSource.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
     return inertial.update(belief.inertial, comparison)[1]
 
 

@@ -91,10 +91,8 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     },
     HandoverState.ARMING: {
         HandoverEvent.REBOOT: (HandoverState.FAILED, SetpointMode.NOTHING),
-        HandoverEvent.LAND: (
-            HandoverState.LANDING,
-            SetpointMode.NOTHING,
-        ),  # arming may have been granted and starts PX4's climb
+        # arming may have been granted and starts PX4's climb
+        HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),
         HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
         HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
         HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
@@ -140,10 +138,8 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     HandoverState.ENGAGED: {
         HandoverEvent.REBOOT: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
         HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),
-        HandoverEvent.SILENCE: (
-            HandoverState.ENGAGED,
-            SetpointMode.SETPOINTS,
-        ),  # the controller brakes and holds: the vehicle may still receive setpoints
+        # the controller brakes and holds: the vehicle may still receive setpoints
+        HandoverEvent.SILENCE: (HandoverState.ENGAGED, SetpointMode.SETPOINTS),
         HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
         HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
         HandoverEvent.UNCLEAR: (HandoverState.UNCLEAR, SetpointMode.NOTHING),
@@ -153,10 +149,8 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     HandoverState.FAILSAFE: {
         HandoverEvent.REBOOT: (HandoverState.FAILED, SetpointMode.NOTHING),
         HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),
-        HandoverEvent.GRANTED: (
-            HandoverState.CLIMBING,
-            SetpointMode.NEUTRAL,
-        ),  # the failsafe has ended, and the climb continues
+        # the failsafe has ended, and the climb continues
+        HandoverEvent.GRANTED: (HandoverState.CLIMBING, SetpointMode.NEUTRAL),
         HandoverEvent.REFUSED: (HandoverState.LANDING, SetpointMode.NOTHING),
         HandoverEvent.ENGAGE: (HandoverState.ENGAGING, SetpointMode.NEUTRAL),
         HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
@@ -166,10 +160,8 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     HandoverState.UNCLEAR: {
         HandoverEvent.REBOOT: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
         HandoverEvent.LAND: (HandoverState.LANDING, SetpointMode.NOTHING),  # the operator's order
-        HandoverEvent.REFUSED: (
-            HandoverState.LANDING,
-            SetpointMode.NOTHING,
-        ),  # it flies by itself, and no pilot has shown control in time
+        # it flies by itself, and no pilot has shown control in time
+        HandoverEvent.REFUSED: (HandoverState.LANDING, SetpointMode.NOTHING),
         HandoverEvent.ENGAGE: (HandoverState.RETURNING, SetpointMode.NEUTRAL),
         HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
         HandoverEvent.FAILSAFE: (HandoverState.FAILSAFE, SetpointMode.NOTHING),
@@ -189,10 +181,8 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     HandoverState.SETTLING: {
         HandoverEvent.REFUSED: (HandoverState.FAILED, SetpointMode.NOTHING),
         HandoverEvent.DISARMED: (HandoverState.DONE, SetpointMode.NOTHING),
-        HandoverEvent.FAILSAFE: (
-            HandoverState.LANDING,
-            SetpointMode.NOTHING,
-        ),  # the landing was the failsafe's and has ended: its climb continues
+        # the landing was the failsafe's and has ended: its climb continues
+        HandoverEvent.FAILSAFE: (HandoverState.LANDING, SetpointMode.NOTHING),
         HandoverEvent.UNCLEAR: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
         HandoverEvent.OTHER: (HandoverState.TAKEN_OVER, SetpointMode.NOTHING),
     },

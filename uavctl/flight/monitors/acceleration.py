@@ -3,8 +3,8 @@
 1. The observer (`uavctl.flight.monitors.observer`) gives the unexplained acceleration at each position.
 2. Drag explains the part that points against the velocity.
 3. Where inertial data show the same acceleration, it is wind or a hit: a push, and positions are right.
-4. What is left is compared with its bound: for a while, or at once if it is plainly beyond. Then: release.
-5. Three clipped innovations of the last five: positions scatter. Then: release.
+4. What is left is compared with its bound: for a while, or at once if it is plainly beyond. Then: end the plans.
+5. Three clipped innovations of the last five: positions scatter. Then: end the plans.
 
 A frame that is turned, mirrored or in another unit gives the acceleration sent a wrong direction or size. A marker that
 came loose shows none at all.

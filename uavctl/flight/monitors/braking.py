@@ -1,7 +1,7 @@
 """Monitor: does braking slow the vehicle down, by its own velocity?
 
 1. The speed is noted when braking begins, and again where positions come back after a silence.
-2. A second later the speed is more than 0.8 of it, and 0.3 m/s. Then: release.
+2. A second later the speed is more than 0.8 of it, and 0.3 m/s. Then: end the plans.
 
 False alarms (docs/soak.md): 0 of 200 missions.
 """

@@ -3,7 +3,7 @@
 1. The shared record of motion takes the tick (`uavctl.flight.monitors.motion`).
 2. Each believed position goes through the monitors of acceleration and velocity.
 3. Then the monitors of the tick are asked: an open contradiction, outside the room, braking.
-4. The first verdict counts. A position is clean if all was quiet at it: what came later is dropped after a release.
+4. The first verdict counts. A position is clean if all was quiet at it: what came later is dropped when plans end.
 """
 
 from __future__ import annotations

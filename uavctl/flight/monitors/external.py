@@ -1,10 +1,10 @@
 """Monitor: is a controller of another package too late, or too close to a wall?
 
-1. Its answer takes longer than half a second, or three in a row take longer than a tick. Then: release.
-2. Braking now would end beyond a limit by more than half of the margin. Then: release, in place of its next plan.
+1. Its answer takes longer than half a second, or three in a row take longer than a tick. Then: end the plans.
+2. Braking now would end beyond a limit by more than half of the margin. Then: end the plans, in place of the next one.
 
 Nothing says that such a controller keeps the limits. It may come to a stop half as far beyond them as the monitor
-`uavctl.flight.monitors.outside` allows, which would not brake before it releases the vehicle.
+`uavctl.flight.monitors.outside` allows, which would not brake before it ends the plans.
 
 False alarms: none is known; who flies measures the time, and a replay takes it from the recording.
 """

@@ -31,7 +31,7 @@ DISTRUST_NS = 3_000_000_000  # least time of distrust
 CONSISTENT_NS = 1_000_000_000
 
 
-class Source(Enum):
+class ComparedSource(Enum):
     """Source that inertial data are compared with."""
 
     MODEL = auto()
@@ -50,7 +50,7 @@ class InertialTrust(msgspec.Struct, frozen=True):
 class InertialObservation(msgspec.Struct, frozen=True):
     """Comparison of inertial data with another source."""
 
-    source: Source
+    source: ComparedSource
     is_consistent: bool
     at_ns: int  # time of the comparison [ns]
     captured_ns: int  # capture time of the newest position before it [ns]
@@ -64,7 +64,7 @@ def update(trust: InertialTrust, observation: InertialObservation) -> tuple[Iner
     at_ns = observation.at_ns
     if trust.distrusted_ns is not None:
         return _update_distrusted(trust, trust.distrusted_ns, observation), NO_VERDICT
-    if observation.source is Source.MODEL:
+    if observation.source is ComparedSource.MODEL:
         if observation.is_consistent:
             return InertialTrust(used_ns=at_ns), NO_VERDICT
         trust = replace(trust, refused=trust.refused + 1)
@@ -76,7 +76,7 @@ def update(trust: InertialTrust, observation: InertialObservation) -> tuple[Iner
 
 
 def _update_distrusted(trust: InertialTrust, since_ns: int, observation: InertialObservation) -> InertialTrust:
-    if observation.source is not Source.POSITION or not observation.is_consistent:
+    if observation.source is not ComparedSource.POSITION or not observation.is_consistent:
         return trust
     is_close = observation.at_ns - observation.captured_ns <= CONSISTENT_NS
     if is_close and observation.at_ns - since_ns >= DISTRUST_NS:

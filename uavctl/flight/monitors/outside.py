@@ -2,7 +2,7 @@
 
 1. Each side of each axis: is the estimate beyond the limit by more than the margin, and not on its way back?
 2. Would the distance to stop end beyond the margin?
-3. One of both holds for 0.1 s. Then: release.
+3. One of both holds for 0.1 s. Then: end the plans.
 
 False alarms (docs/soak.md): 0 of 200 missions.
 """

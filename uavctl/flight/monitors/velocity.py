@@ -2,10 +2,10 @@
 
 1. At each position the offset is noted: the position minus the distance by the vehicle's own velocity.
 2. The slope of the offsets over a second or so is the difference of both velocities. Stamps that are late explain a
-   part that is the acceleration times the delay. What is left is compared with its bound. Then: release.
+   part that is the acceleration times the delay. What is left is compared with its bound. Then: end the plans.
 3. The mean offsets of half a minute show a frame that creeps: their change is compared with a bound that grows with
-   time. Then: release.
-4. Velocities contradicted each other, and then no position came for 0.6 s. Then: release.
+   time. Then: end the plans.
+4. Velocities contradicted each other, and then no position came for 0.6 s. Then: end the plans.
 5. While positions that have come back correct the vehicle's own velocity, no difference counts.
 
 False alarms (docs/soak.md): 0 of 200 missions, with a bound of 0.255 m/s. The largest difference was 0.036 m/s.
