@@ -124,11 +124,7 @@ def make_lanes(flight: FlightData) -> Iterator[Lane]:
             flight, "refused", "fallback", "a position that was not believed", (d for d in decisions if d.rejected)
         ),
         _make_mark_lane(
-            flight,
-            "limited",
-            "plan",
-            "a setpoint that the limiter changed",
-            (s for s in flight.setpoints if s.limited),
+            flight, "limited", "plan", "a setpoint that the limiter changed", (s for s in flight.setpoints if s.limited)
         ),
         Lane(
             "gave way",
