@@ -18,6 +18,7 @@ from uavctl.flight.fallback import (
     compute_return_accel,
     compute_stop_m,
     request_fallback,
+    restart_hold,
 )
 from uavctl.flight.limits import ZERO
 from uavctl.records import ControlMode, Vec3
@@ -213,6 +214,13 @@ def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
     before = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
     for after_ns, wanted in ((round(held_s * S) - 1, HOLD), (round(held_s * S), LAND)):
         assert advance_fallback(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
+
+
+def test_positions_that_are_back_let_the_time_to_hold_begin_again() -> None:
+    holding = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
+    assert restart_hold(holding, 6 * S) == replace(holding, held_ns=6 * S)
+    braking = Fallback(mode=BRAKE, since_ns=5 * S)
+    assert restart_hold(braking, 6 * S) == braking
 
 
 def test_nobody_is_blind_unless_it_is_said() -> None:
