@@ -33,12 +33,13 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "uavctl/flight/monitors/outside.py": ENVELOPE,
     "uavctl/flight/monitors/vehicle_velocity.py": ENVELOPE,
     "uavctl/flight/monitors/velocity.py": ENVELOPE,
+    "uavctl/flight/monitors/velocity_change.py": ("tests/flight/test_velocity_change.py",),
     "uavctl/flight/monitors/verdict.py": (
         "tests/flight/test_inertial_monitor.py",
         "tests/flight/test_external_monitor.py",
     ),
     "uavctl/flight/monitors/outliers.py": ("tests/flight/test_reach_rules.py",),
-    "uavctl/flight/monitors/frozen.py": ("tests/flight/test_stuck_rules.py", "tests/flight/test_samples.py"),
+    "uavctl/flight/monitors/frozen.py": ("tests/flight/test_frozen_rules.py", "tests/flight/test_samples.py"),
     "uavctl/mavlink/handover_states.py": ("tests/mavlink/test_mode.py",),
     "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py", "tests/mavlink/test_gate.py"),
 }

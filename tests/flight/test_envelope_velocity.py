@@ -33,6 +33,7 @@ from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.velocity import VelocityState
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
 
@@ -370,6 +371,21 @@ def test_which_own_velocity_may_be_braked_on(
     ours = structs.replace(seen(AT_NS, vehicle_motion=motion(own, AT_NS)), velocity_mps=known)
     watching = monitors(is_contradicted=contradicted)
     assert trusted_velocity(watching, ours, age_s, PARAMETERS) == (own if believed else None)
+
+
+@pytest.mark.parametrize(
+    ("agreed_ns", "wrong_ns", "believed"),
+    [(AT_NS - 300 * MS, None, True), (AT_NS - 300 * MS - 1, None, False), (None, None, False), (AT_NS, AT_NS, False)],
+)
+def test_an_own_velocity_that_inertial_data_support_is_believed_against_positions(
+    agreed_ns: int | None, wrong_ns: int | None, believed: bool
+) -> None:
+    ours = structs.replace(seen(AT_NS, vehicle_motion=motion((0.5, 0.0, 0.0), AT_NS)), velocity_mps=ZERO)
+    watching = structs.replace(
+        monitors(is_contradicted=True),
+        velocity_change=VelocityChangeState(agreed_ns=agreed_ns, velocity_wrong_ns=wrong_ns),
+    )
+    assert trusted_velocity(watching, ours, 0.0, PARAMETERS) == ((0.5, 0.0, 0.0) if believed else None)
 
 
 @pytest.mark.fault(42)

@@ -18,6 +18,7 @@ from uavctl.flight.monitors.frozen import (
     SourceTrack,
     SourceTracks,
     is_frozen,
+    is_repeat,
     is_suspect,
     track_sample,
     update,
@@ -52,8 +53,10 @@ def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_
     assert (watch.resolution_m, watch.repeats, watch.first_ns) == (0.5, 2, START_NS + 2 * TICK_NS)
     assert watch.open_loop_belief is not None
     assert watch.open_loop_belief.at_ns == watch.at_ns == START_NS + 4 * TICK_NS
+    assert [is_repeat(watch, at_ns) for at_ns in (watch.at_ns, watch.at_ns - 1)] == [True, False]
     watch = watched([0.0, 0.5, 0.5, 0.25])["camera"]
     assert (watch.repeats, watch.open_loop_belief) == (0, None)
+    assert not is_repeat(watch, watch.at_ns)
     assert watched([0.0])["camera"].resolution_m == 0.0
     assert watched([0.0, 3.0])["camera"].resolution_m == 3.0
 

@@ -140,3 +140,13 @@ def test_an_old_own_velocity_is_no_sample() -> None:
         VelocityState(),
     )
     assert (after.samples, after.disagrees_ns) == ((), None)
+
+
+def test_the_same_own_velocity_is_one_sample() -> None:
+    observation = structs.replace(
+        seen(START_NS, sent=ACCEL, vehicle_motion=motion(north(1.0), START_NS)), inertial_mps2=ACCEL
+    )
+    tick = TickObservation(observation, update_motion(Motion(), observation, PARAMETERS), PARAMETERS)
+    once = update(INITIAL, tick, NO_POSITIONS)
+    assert [captured_ns for captured_ns, *_ in once.samples] == [START_NS]
+    assert update(once, tick, NO_POSITIONS) == once
