@@ -28,6 +28,7 @@ class TickContext(msgspec.Struct, frozen=True, eq=False):
     """All that is known when a tick begins."""
 
     inputs: StepInput
+    at_ns: int  # time of the tick [ns]
     controller: Controller
     is_climbing_or_landing: bool  # whether the vehicle climbs or lands by itself, as the hand-over requested
     step: int  # k
@@ -37,11 +38,6 @@ class TickContext(msgspec.Struct, frozen=True, eq=False):
     was_in_control: bool  # whether the controller flew the vehicle in the tick before
     not_ready_reason: str  # why the vehicle takes no setpoints; empty if it does
     is_controllable: bool  # whether the vehicle is known to be in the air and to take setpoints
-
-    @property
-    def at_ns(self) -> int:
-        """Time of the tick [ns]."""
-        return self.inputs.at_ns
 
 
 class FilterView(msgspec.Struct, frozen=True, eq=False):
@@ -62,6 +58,7 @@ def locate_on_grid(
     mode, not_ready_reason, vehicle = state.mode, describe_not_ready(inputs.vehicle), inputs.vehicle
     return TickContext(
         inputs=inputs,
+        at_ns=inputs.at_ns,
         controller=controller,
         is_climbing_or_landing=is_climbing_or_landing,
         step=step,

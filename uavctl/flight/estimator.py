@@ -84,9 +84,7 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
 def begin_history(kalman: Kalman, origin_ns: int, at_ns: int) -> FilterHistory:
     """Begin an empty history at `at_ns`, on the grid of boundaries origin_ns + n Δt."""
     return FilterHistory(
-        origin_ns=origin_ns,
-        window_begin_ns=_compute_window_begin_ns(kalman, at_ns),
-        anchor=FilterState(belief=None, input=None),
+        origin_ns=origin_ns, window_begin_ns=at_ns - kalman.window_ns, anchor=FilterState(belief=None, input=None)
     )
 
 
@@ -99,7 +97,7 @@ def advance_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> Filter
 
 def move_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
     """Move the window up to `at_ns`, and its anchor to the state at its begin."""
-    begin_ns, past = max(history.window_begin_ns, _compute_window_begin_ns(kalman, at_ns)), 0
+    begin_ns, past = max(history.window_begin_ns, at_ns - kalman.window_ns), 0
     while past < len(history.entries) and history.entries[past].key[0] <= begin_ns:
         past += 1
     anchor = _compute_state(kalman, history, past)
@@ -108,7 +106,7 @@ def move_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHis
 
 def is_mark_due(kalman: Kalman, history: FilterHistory, at_ns: int) -> bool:
     """Whether a boundary has come at which no belief is kept yet."""
-    window_begin_ns = max(history.window_begin_ns, _compute_window_begin_ns(kalman, at_ns))
+    window_begin_ns = max(history.window_begin_ns, at_ns - kalman.window_ns)
     mark = _find_mark(kalman, history, at_ns)
     return mark[0] > window_begin_ns and (not history.entries or history.entries[-1].key < mark)
 
@@ -295,7 +293,7 @@ def make_estimate(kalman: Kalman, belief: Belief, *, with_cov: bool = True) -> E
         cov=tuple(map(tuple, belief.cov[: bias.start, : bias.start].tolist())) if with_cov else (),
         # d within ±d_max
         bias=tuple(
-            min(max(d, -bound), bound) for d, bound in zip(belief.mean[bias].tolist(), kalman.bias_bounds, strict=True)
+            [min(max(d, -most), most) for d, most in zip(belief.mean[bias].tolist(), kalman.bias_bounds, strict=True)]
         ),
     )
 
@@ -358,10 +356,6 @@ def _compute_state(kalman: Kalman, history: FilterHistory, count: int) -> Filter
         before = states[-1] if states else history.anchor
         states.append(_apply_entry(kalman, history, before, history.entries[len(states)]))
     return states[count - 1] if count else history.anchor
-
-
-def _compute_window_begin_ns(kalman: Kalman, at_ns: int) -> int:
-    return at_ns - round(kalman.parameters.window_s * 1e9)
 
 
 def _insert(history: FilterHistory, new: FilterEvent) -> FilterHistory:

@@ -120,9 +120,10 @@ def _report_faults(
 def _report_samples(context: TickContext, measured: Measured) -> Iterable[Event]:
     """Report samples that were refused, and ticks that were missed."""
     at_ns, refused = context.at_ns, [why for _, why in measured.samples.refused]
-    for code in sorted(set(refused) - {EventCode.SAMPLE_REPEATED}):  # some sources send each value twice
-        text = "the sample counts as lost"
-        yield _make_event(at_ns, Severity.WARNING, code, text, refused.count(code))
+    for code in sorted(set(refused)):
+        if code != EventCode.SAMPLE_REPEATED:  # some sources send each value twice
+            text = "the sample counts as lost"
+            yield _make_event(at_ns, Severity.WARNING, code, text, refused.count(code))
     if context.inputs.missed_ticks:
         text = "ticks were missed; they are not made up for"
         yield _make_event(at_ns, Severity.WARNING, EventCode.MISSED_TICKS, text, context.inputs.missed_ticks)

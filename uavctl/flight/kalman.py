@@ -80,11 +80,13 @@ class Kalman:
     # Largest bias that is flown against, of each input that has one [input units]; made from the others
     bias_bounds: tuple[float, ...] = field(init=False)
     bias: slice = field(init=False)  # slice of the biases among the states; made from the others
+    window_ns: int = field(init=False)  # samples later than this are refused [ns]; made from the parameters
 
     def __post_init__(self) -> None:
         bounds = (self.parameters.bias_bounds or (self.parameters.bias_max,) * self.n_bias)[: self.n_bias]
         object.__setattr__(self, "bias_bounds", bounds)
         object.__setattr__(self, "bias", slice(self.n_x - self.n_inertial - self.n_bias, self.n_x - self.n_inertial))
+        object.__setattr__(self, "window_ns", round(self.parameters.window_s * 1e9))
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):

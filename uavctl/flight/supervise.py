@@ -196,12 +196,11 @@ def _has_drifted(state: ControlState, belief: Belief, view: FilterView, context:
     if has_jumped or change.disagrees_ns is not None or change.velocity_wrong_ns is not None:
         return False
     # Both at the same time: the vehicle's velocity of a quarter of a second ago does not show how it moves now.
-    then = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns))
-    if then is None:
-        return False
-    observation = observe_velocity(
-        state, state.monitors.engaged, make_estimate(controller.kalman, then, with_cov=False), context
-    )
+    then, estimate = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns)), None
+    if then is not None:
+        # A velocity of now needs no other estimate than the tick's.
+        estimate = view.estimate if then is belief else make_estimate(controller.kalman, then, with_cov=False)
+    observation = observe_velocity(state, state.monitors.engaged, estimate, context)
     return observation is not None and not vehicle_velocity.is_inertial_consistent(observation)
 
 
