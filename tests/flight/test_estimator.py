@@ -38,6 +38,7 @@ from uavctl.flight.estimator import (
 from uavctl.flight.kalman import (
     Belief,
     Kalman,
+    divide_by_spread,
     is_consistent,
     make_kalman,
     predict,
@@ -150,6 +151,17 @@ def test_an_update_has_the_bits_of_its_formula_written_down(axes: tuple[str, ...
         found = update_with_position(kalman, belief, one)
         # Rows picked out of the covariance and a product with them differ in nothing either.
         assert found.mean.tobytes() == mean.tobytes() and found.cov.tobytes() == cov.tobytes()
+
+
+@pytest.mark.parametrize("count", range(1, 7))
+def test_the_gain_of_independent_axes_has_the_bits_of_the_solution(count: int) -> None:
+    rng = np.random.default_rng(count)
+    for _ in range(500):
+        root, ph = rng.normal(size=(count, count)), rng.normal(size=(24, count))
+        coupled = root @ root.T * 10.0 ** rng.uniform(-6, 2)
+        independent = np.diag(coupled.diagonal() * 10.0 ** rng.uniform(-3, 3, count))
+        for spread in (coupled, independent):
+            assert divide_by_spread(ph, spread).tobytes() == np.linalg.solve(spread, ph.T).T.tobytes()
 
 
 @pytest.mark.parametrize("axes", [("north",), ("north", "east", "down")])

@@ -76,6 +76,7 @@ class Kalman:
     inertial_u: Array  # the same for the input (n_inertial, n_u)
     inertial_noise: Array  # covariance of their noise (n_inertial, n_inertial)
     push_cov: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
+    measured_z: Array  # measurement matrix of positions, then velocities, for z (2 n_axes, n_x + n_w)
     identity: Array  # of the size of z
     # Largest bias that is flown against, of each input that has one [input units]; made from the others
     bias_bounds: tuple[float, ...] = field(init=False)
@@ -115,6 +116,8 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
     if n_inertial and n_bias:
         drift = slice(plant.n_w, plant.n_w + n_bias)
         w_without_inertial[drift, drift] *= DRIFT_WITHOUT_INERTIAL**2
+    identity = np.eye(model.n_x + model.n_w)
+    measured_index = np.array(plant.position_index + plant.velocity_index, dtype=np.intp)
     return Kalman(
         propagation=make_propagation(model, dt_ns),
         w=model.w,
@@ -124,13 +127,14 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
         n_bias=n_bias,
         n_inertial=n_inertial,
         axes=tuple(AXES.index(axis) for axis in plant.axes),
-        measured_index=np.array(plant.position_index + plant.velocity_index, dtype=np.intp),
+        measured_index=measured_index,
         parameters=parameters,
         inertial_z=inertial_z,
         inertial_u=inertial_u,
         inertial_noise=np.eye(n_inertial) * parameters.inertial_std_mps2**2,
         push_cov=parameters.bias_max**2 * push @ push.T,
-        identity=np.eye(model.n_x + model.n_w),
+        measured_z=identity[measured_index],
+        identity=identity,
     )
 
 
@@ -251,26 +255,42 @@ def make_first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
 def update_with_position(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
     """Update a belief with a sample. Joseph's form keeps the covariance symmetric and positive semidefinite."""
     values, variances = read_measurement(kalman, sample)
-    index = kalman.measured_index[: len(values)]
-    noise = kalman.identity[: len(values), : len(values)] * variances
     if kalman.n_inertial:
         belief = _judge_inertial(kalman, belief, values, variances)
-    # P H'
-    ph = belief.cov[:, index]
-    # K = P H' (H P H' + R)⁻¹
-    gain = np.linalg.solve(ph[index] + noise, ph.T).T
-    # I - K H
-    keep = kalman.identity.copy()
-    keep[:, index] -= gain
+    n, cov = len(values), belief.cov
+    of_z, noise = kalman.measured_z[:n], kalman.identity[:n, :n] * variances
+    # ν = y - H z
+    innovation = values - of_z.dot(belief.mean)
+    # S = H P H' + R
+    ph = cov.dot(of_z.T)
+    spread = of_z.dot(ph) + noise
+    # K = P H' S⁻¹
+    gain = divide_by_spread(ph, spread)
     return Belief(
         at_ns=belief.at_ns,
         captured_ns=read_capture_ns(sample),
-        # z = z + K (y - H z)
-        mean=belief.mean + gain.dot(values - belief.mean[index]),
-        # P = (I - K H) P (I - K H)' + K R K'
-        cov=_symmetric(keep.dot(belief.cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
+        # z = z + K ν
+        mean=belief.mean + gain.dot(innovation),
+        cov=_correct_covariance(kalman, cov, gain, of_z, noise),
         inertial=belief.inertial,
     )
+
+
+def divide_by_spread(ph: Array, spread: Array) -> Array:
+    """Compute the gain K = P H' S⁻¹ from P H' (n, m) and the covariance S (m, m) of an innovation."""
+    variances = spread.diagonal()
+    if np.count_nonzero(spread) == len(variances):
+        # S is diagonal where the axes are independent: K_ij = (P H')_ij (1 / S_jj), as `solve` rounds it
+        return ph * (1.0 / variances)
+    return np.asarray(np.linalg.solve(spread, ph.T).T, dtype=np.float64)
+
+
+def _correct_covariance(kalman: Kalman, cov: Array, gain: Array, of_z: Array, noise: Array) -> Array:
+    """Correct a covariance by a measurement of matrix H = `of_z` (m, n) and noise of covariance R (m, m)."""
+    # I - K H
+    keep = kalman.identity - gain.dot(of_z)
+    # P = (I - K H) P (I - K H)' + K R K'
+    return _symmetric(keep.dot(cov).dot(keep.T) + gain.dot(noise).dot(gain.T))
 
 
 def is_consistent(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> bool:
@@ -334,16 +354,13 @@ def update_with_inertial(kalman: Kalman, belief: Belief, accel_mps2: Array, u: A
     if not plausible:
         return replace(belief, inertial=trust)
     # K = P M_z' S⁻¹
-    gain = np.linalg.solve(spread, ph.T).T
-    # I - K M_z
-    keep = kalman.identity - gain.dot(of_z)
+    gain = divide_by_spread(ph, spread)
     return Belief(
         at_ns=belief.at_ns,
         captured_ns=belief.captured_ns,
         # z = z + K ν
         mean=belief.mean + gain.dot(innovation),
-        # P = (I - K M_z) P (I - K M_z)' + K R K'
-        cov=_symmetric(keep.dot(cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
+        cov=_correct_covariance(kalman, cov, gain, of_z, noise),
         inertial=trust,
     )
 
@@ -365,6 +382,7 @@ def _select_axes(vector: Vec3, axes: tuple[int, ...]) -> list[float]:
 
 def _symmetric(matrix: Array) -> Array:
     # (A + A') / 2
-    both: Array = matrix + matrix.T
+    both: Array = matrix.T.copy()
+    both += matrix
     both *= 0.5
     return both
