@@ -69,14 +69,14 @@ def simulate_model(
             items.append(("", at_ns, decision(tick, at_ns, step, u, age, boundary=part == 0)))
         coming.append(u)
         acting = coming.pop(0)
-        f, g = kalman.propagation.over(CAPTURED_NS)
+        f, _, g = kalman.propagation.over(CAPTURED_NS)
         observed = (f @ z + g @ acting)[kalman.measured_index[: len(kalman.axes)]] + rng.normal(
             0.0, believed.position_std_m, 3
         )
         if step == 0 or rng.random() >= loss:
             stamp_ns = begun_ns + CAPTURED_NS + late_ns
             waiting = [sample(observed, stamp_ns, stamp_ns + ARRIVED_NS, step, believed.position_std_m)]
-        f, g = kalman.propagation.over(dt_ns)
+        f, _, g = kalman.propagation.over(dt_ns)
         state = (f @ z + g @ acting)[: kalman.n_x]
     return FlightData.from_records(items)
 

@@ -197,12 +197,12 @@ def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_
     while now_ns < at_ns:
         boundary_ns = now_ns - (now_ns - origin_ns) % propagation.dt_ns + propagation.dt_ns
         stop_ns = min(at_ns, boundary_ns)
-        f, g = propagation.over(stop_ns - now_ns)
+        f, f_transposed, g = propagation.over(stop_ns - now_ns)
         # z = F z + G u
         mean = f.dot(mean)
         mean += g.dot(acting)
         # P = F P F'
-        cov = _symmetric(f.dot(cov).dot(f.T))
+        cov = _symmetric(f.dot(cov).dot(f_transposed))
         if stop_ns == boundary_ns:
             # w ~ N(0, W), independent of x
             mean[n_x:] = 0.0
@@ -289,8 +289,8 @@ def _correct_covariance(kalman: Kalman, cov: Array, gain: Array, of_z: Array, no
     """Correct a covariance by a measurement of matrix H = `of_z` (m, n) and noise of covariance R (m, m)."""
     # I - K H
     keep = kalman.identity - gain.dot(of_z)
-    # P = (I - K H) P (I - K H)' + K R K'
-    return _symmetric(keep.dot(cov).dot(keep.T) + gain.dot(noise).dot(gain.T))
+    # P = (I - K H) P (I - K H)' + K R K'; a copy of the transpose makes the product faster
+    return _symmetric(keep.dot(cov).dot(keep.T.copy()) + gain.dot(noise).dot(gain.T))
 
 
 def is_consistent(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> bool:
