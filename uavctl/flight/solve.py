@@ -7,6 +7,8 @@
 
 from __future__ import annotations
 
+from struct import iter_unpack
+
 import msgspec
 import numpy as np
 
@@ -91,6 +93,7 @@ def _make_row(values: Array) -> Vector:
 
 
 def _make_rows(values: Array) -> Matrix:
-    if values.strides[0] == 0 and len(values):  # one row, broadcast
+    if len(values) and (values.strides[0] == 0 or not values.size):  # rows are alike: broadcast, or empty
         return (_make_row(values[0]),) * len(values)
-    return tuple(map(tuple, values.tolist()))
+    # Rows of doubles, without a list for each
+    return tuple(iter_unpack(f"{values.shape[1]}d", values.tobytes()))
