@@ -83,8 +83,11 @@ def measure(state: ControlState, context: TickContext) -> Measured:
     history = estimator.history or begin_history(kalman, origin_ns, inputs.at_ns)
     history, pending_inputs = apply_due_inputs(history, estimator.pending_inputs, inputs.at_ns)
     is_due = is_mark_due(kalman, history, inputs.at_ns)
+    sources = estimator.sources
+    if not context.was_in_control:
+        sources = replace(sources, jumps=jumps.suspend(sources.jumps, inputs.at_ns))
     samples = gate_samples(
-        kalman, controller.reach, history, estimator.sources, inputs, controller.horizon, estimator.consecutive_samples
+        kalman, controller.reach, history, sources, inputs, controller.horizon, estimator.consecutive_samples
     )
     restarted = samples.source_moved and not context.was_in_control
     if restarted:

@@ -8,6 +8,7 @@
 3. The shift fades by `FADE_MPS`. So the estimate comes to the new solution slowly, and lies between both while they
    alternate. All jumps together shift positions by no more than `MAX_SHIFT_M`.
 
+While others fly the vehicle nothing is a jump: its own climb and landing must end at once where positions are wrong.
 A wrong frame, another body or a marker that came loose makes errors that grow with time or jump further: they are not
 shifted.
 """
@@ -63,6 +64,11 @@ def note_position(track: JumpTrack, at_ns: int) -> JumpTrack:
     gap_ns = at_ns - track.seen_ns
     settled_ns = at_ns + min(gap_ns, LONGEST_NS) if gap_ns > SILENCE_NS else track.settled_ns
     return replace(track, seen_ns=max(at_ns, track.seen_ns), settled_ns=settled_ns)
+
+
+def suspend(track: JumpTrack, at_ns: int) -> JumpTrack:
+    """Judge no position of a tick at `at_ns`: while others fly the vehicle, positions that jump count in full."""
+    return JumpTrack(seen_ns=track.seen_ns, settled_ns=max(track.settled_ns, at_ns + 1))
 
 
 def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s: float) -> tuple[JumpTrack, bool]:
