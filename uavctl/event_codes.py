@@ -85,6 +85,8 @@ class EventCode(StrEnum):
     # Relay of positions to the vehicle
     RELAY_SILENT = "relay-silent"
     RELAY_RESUMED = "relay-resumed"
+    RELAY_ATTITUDE = "relay-attitude"  # poses have a wrong attitude [what is wrong]
+    RELAY_ATTITUDE_RIGHT = "relay-attitude-right"
     # Errors that do not end the flight
     INTERNAL_ERROR = "internal-error"
     # Recorder

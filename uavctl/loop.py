@@ -205,6 +205,7 @@ class ControlLoop:
             last_ns=relay.last_ns,
             alone=bool(self.account.control_error) or has_control_ended,
             silent_for=relay.silent_for,
+            attitude_fault=relay.attitude_fault,
         )
 
     @property
@@ -343,10 +344,11 @@ class ControlLoop:
             for data in self._links[VEHICLE].encode_relayed_poses(self._relay, at_ns, refused=refused):
                 send(self._record_outgoing(VEHICLE, data, at_ns))
         if self._vehicle is not None:
-            relay_event = self._relay.make_event(at_ns, held_back=is_held_back, armed=self._vehicle.armed)
-            if relay_event is not None:
-                self._put("/uavctl/event", at_ns, relay_event)
-                notices.append(relay_event)
+            silence = self._relay.make_event(at_ns, held_back=is_held_back, armed=self._vehicle.armed)
+            for event in (self._relay.make_attitude_event(at_ns), silence):
+                if event is not None:
+                    self._put("/uavctl/event", at_ns, event)
+                    notices.append(event)
 
     def _update_handover(
         self, inputs: StepInput, output: TickOutput, send: Send, notices: list[Event]

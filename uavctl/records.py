@@ -350,6 +350,7 @@ class RelayStats(Record, frozen=True, kw_only=True):
     last_ns: int | None  # time at which the last one went
     alone: bool  # nothing else is sent: control has ended, or failed
     silent_for: str = ""  # reason why none has gone for half a second; empty while they go
+    attitude_fault: str = ""  # what is wrong with the attitude of poses; empty while it is right
 
 
 class LinkStats(Record, frozen=True, kw_only=True):

@@ -13,6 +13,7 @@ _ROOTS = (
     Cause.BATTERY_EMPTY,
     Cause.BATTERY_LOW,
     Cause.STOOD_STILL,
+    Cause.RELAY_ATTITUDE,
     Cause.RELAY_SILENT,
     Cause.POSITIONS_FROZEN,
     Cause.POSITIONS_JUMPED,

@@ -39,6 +39,7 @@ from logs.report.rules_positions import (
     find_absent_positions,
     find_refused_samples,
     find_relay_silence,
+    find_wrong_attitude,
     find_wrong_positions,
 )
 from logs.report.rules_takeover import find_failsafe, find_takeover, find_vehicle_texts
@@ -154,6 +155,7 @@ RULES: tuple[Callable[[FlightEvidence], Iterator[Finding]], ...] = (
     find_refused_samples,
     find_wrong_positions,
     find_absent_positions,
+    find_wrong_attitude,
     find_relay_silence,
     find_refused_start,
     find_failed_takeoff,

@@ -93,6 +93,17 @@ def find_absent_positions(e: FlightEvidence) -> Iterator[Finding]:
         yield Finding(Cause.POSITIONS_ABSENT, 0.0, f"none came in {seconds(e.flight.duration_s)}")
 
 
+def find_wrong_attitude(e: FlightEvidence) -> Iterator[Finding]:
+    """Find that poses had another attitude than the vehicle, and so were not passed on to it."""
+    event = next((event for event in e.flight.events if event.code == EventCode.RELAY_ATTITUDE), None)
+    if event is not None:
+        kept_count = e.flight.relays[-1].kept.get(event.subject, 0) if e.flight.relays else 0
+        since_s = e.to_seconds(event.at_ns)
+        text = f"from {seconds(since_s)}: {REASONS.get(event.subject, 'their attitude was wrong')}"
+        kept_text = f"; {count(kept_count, 'pose')} not passed on" if kept_count else ""
+        yield Finding(Cause.RELAY_ATTITUDE, since_s, text + kept_text)
+
+
 def find_relay_silence(e: FlightEvidence) -> Iterator[Finding]:
     """Find that the vehicle, which lives on the positions that are passed on to it, got none."""
     silent_s = e.find_first_s(EventCode.RELAY_SILENT)

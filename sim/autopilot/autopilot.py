@@ -100,7 +100,9 @@ class Autopilot:
         )
         origin = GeodeticOrigin(*profile.origin_deg_m)
         errors = ERRORS[profile.name].scale(config.sim.inertial.errors)
-        self.inertial = InertialSensors(errors, vehicle, seed, flown=config.sim.inertial.flown)
+        self.inertial = InertialSensors(
+            errors, vehicle, seed, lambda: self.estimator.heading_error_rad, flown=config.sim.inertial.flown
+        )
         parts = self.pilot, self.estimator, self.inertial, self.parameters
         sources = TelemetrySources(profile, vehicle, *parts, origin, clock, config.sim.streams)
         self.telemetry = Telemetry(sources, start_ns)

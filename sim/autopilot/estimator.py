@@ -13,7 +13,7 @@ from typing import Any
 
 from sim.autopilot.parameters import Parameters
 from sim.autopilot.profile import SimulatedProfile
-from sim.vehicle.interface import ZERO, Vehicle, rotate_to_ned, subtract
+from sim.vehicle.interface import ZERO, Vehicle, compute_heading_rad, rotate_to_ned, subtract
 from uavctl.arrays import SECOND_NS
 from uavctl.records import Vec3
 
@@ -25,6 +25,9 @@ GATE_M = 1.0  # the estimator rejects a sample further off
 PX4_GAP_NS = 200_000_000  # PX4 begins to fuse at more than 5 Hz only
 # PX4 fuses samples up to EKF2_DELAY_MAX (200 ms) back. It drops those 100 ms older, and those from the future.
 PX4_AGES_S = (-0.1, 0.3)
+HEADING_S = 1.0  # time constant with which an external heading turns the estimated one; assumed
+# ArduPilot limits the innovation of a heading to this, and so follows a wrong one more slowly. Assumed for PX4 too.
+MAX_HEADING_INNOVATION_RAD = 0.5
 START_NS = SECOND_NS  # of good samples before the estimate counts
 LOCAL_FRD, LOCAL_NED, BODY_FRD = 20, 1, 12  # MAV_FRAME
 
@@ -46,6 +49,7 @@ class Estimator:
 
     Attributes:
         may_be_valid: whether its position may count as valid.
+        heading_error_rad: estimated heading less the true one, by external headings.
         passes_checks: whether pre-flight checks that flicker pass.
         has_origin: whether the geographic origin is known; ArduPilot without GPS waits for SET_GPS_GLOBAL_ORIGIN.
     """
@@ -59,6 +63,7 @@ class Estimator:
         self._vehicle = vehicle
         self.has_origin = False
         self.may_be_valid = self.passes_checks = True
+        self.heading_error_rad = 0.0
         self._position_error: Vec3 = ZERO
         self._velocity_error: Vec3 = ZERO
         self._updated_ns = vehicle.now_ns
@@ -84,13 +89,19 @@ class Estimator:
         return p["VISO_TYPE"] != 0 and p["EK3_SRC1_POSXY"] == 6
 
     @property
+    def uses_external_heading(self) -> bool:
+        """Whether external headings are fused."""
+        p = self._parameters
+        return bool(int(p["EKF2_EV_CTRL"]) & 8) if self._profile.name == "px4" else p["EK3_SRC1_YAW"] == 6
+
+    @property
     def has_heading(self) -> bool:
         """Whether there is a source of heading."""
         p = self._parameters
         if self._profile.name == "px4":
             compass = p["SYS_HAS_MAG"] == 1 and p["EKF2_MAG_TYPE"] != 5
-            return compass or bool(int(p["EKF2_EV_CTRL"]) & 8 and self._is_fusing)
-        if p["EK3_SRC1_YAW"] == 6:
+            return compass or (self.uses_external_heading and self._is_fusing)
+        if self.uses_external_heading:
             return self._is_fusing
         return p["EK3_SRC1_YAW"] == 1 and any(p[f"COMPASS_USE{n}"] == 1 for n in ("", "2", "3"))
 
@@ -202,7 +213,21 @@ class Estimator:
         position_m = (msg.x, msg.y, msg.z)
         age_s = self._compute_age_s(stamp_us, at_ns)
         if age_s is not None and all(map(math.isfinite, position_m)) and max(map(abs, position_m)) < 1e6:
+            if self.uses_external_heading:
+                self._fuse_heading(_read_heading_rad(msg), at_ns)
             self._fuse(position_m, self._read_velocity(msg), age_s, at_ns)
+
+    def _fuse_heading(self, heading_rad: float, at_ns: int) -> None:
+        """Turn the estimated heading towards an external one."""
+        true_rad = compute_heading_rad(self._vehicle.attitude)
+        innovation_rad = math.remainder(heading_rad - true_rad - self.heading_error_rad, math.tau)
+        if self._last_ns is None:
+            self.heading_error_rad = innovation_rad
+            return
+        gain = 1.0 - math.exp(-min((at_ns - self._last_ns) * 1e-9, FUSE_S) / HEADING_S)
+        self.heading_error_rad += gain * min(
+            max(innovation_rad, -MAX_HEADING_INNOVATION_RAD), MAX_HEADING_INNOVATION_RAD
+        )
 
     def _accepts_frames(self, msg: Any) -> bool:
         local = (LOCAL_FRD, LOCAL_NED) if self._profile.name == "px4" else (LOCAL_FRD,)
@@ -272,6 +297,10 @@ class Estimator:
             )
         position = (position_gain * innovation_m[0], position_gain * innovation_m[1], position_gain * innovation_m[2])
         self._set_error(_add(self._position_error, position), velocity)
+
+
+def _read_heading_rad(msg: Any) -> float:
+    return float(msg.yaw) if msg.get_type() == "VISION_POSITION_ESTIMATE" else compute_heading_rad(tuple(msg.q))
 
 
 def _add(a: Vec3, b: Vec3) -> Vec3:

@@ -9,7 +9,7 @@ are in docs/vehicle.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
@@ -164,13 +164,23 @@ class InertialSensors:
     `flown` the errors exist from the start, and the vehicle's loops use the wrong attitude.
 
     Args:
+        get_heading_error_rad: returns by how much external headings turn the estimated one.
         flown: whether the vehicle's loops use the estimated attitude.
 
     Attributes:
         next_ns: time of the next attitude error of the loops, None if they use the true attitude.
     """
 
-    def __init__(self, errors: InertialErrors, vehicle: Vehicle, seed: np.random.SeedSequence, *, flown: bool) -> None:
+    def __init__(
+        self,
+        errors: InertialErrors,
+        vehicle: Vehicle,
+        seed: np.random.SeedSequence,
+        get_heading_error_rad: Callable[[], float],
+        *,
+        flown: bool,
+    ) -> None:
+        self._get_heading_error_rad = get_heading_error_rad
         first_seed, second_seed, attitude_seed = seed.spawn(3)
         self._errors, self._vehicle = errors, vehicle
         self._units = Imu(errors, first_seed), Imu(errors, second_seed)
@@ -228,7 +238,7 @@ class InertialSensors:
         return (
             roll + roll_wander.value - right / GRAVITY_MPS2,
             pitch + pitch_wander.value + front / GRAVITY_MPS2,
-            self._heading.value,
+            self._heading.value + self._get_heading_error_rad(),
         )
 
     def _advance_errors(self) -> None:

@@ -166,7 +166,7 @@ VEHICLE = Peer(1, 1)
         (VEHICLE.send("gps_global_origin", 1, 2, 3), GlobalOrigin(system=1, component=1)),
         (
             VEHICLE.send("attitude", 1, 0.5, 0.25, -1.0, 0, 0, 0),
-            Attitude(system=1, component=1, angles_rad=(0.5, 0.25, -1.0), stamp_us=1000),
+            Attitude(system=1, component=1, angles_rad=(0.5, 0.25, -1.0), rates_rps=(0.0, 0.0, 0.0), stamp_us=1000),
         ),
         (VEHICLE.send("attitude", 1, math.nan, 0, 0, 0, 0, 0), None),
     ],

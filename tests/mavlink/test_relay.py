@@ -18,10 +18,12 @@ from uavctl.frames import quaternion_from_euler
 from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.relay import FROZEN_POSES, MAX_AGE_NS, Pose, Relay
+from uavctl.mavlink.vehicle_turn import VehicleTurn
 from uavctl.records import Event, LinkStats, PositionSample, Vec3
 
 NOW = 1_000 * SECOND
 LEVEL = (1.0, 0.0, 0.0, 0.0)
+STILL: dict[str, Any] = {"turn": VehicleTurn(), "armed": False}  # a vehicle that sends no attitude
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 
 
@@ -45,7 +47,7 @@ def relay(**more: Any) -> Relay:
 def test_a_pose_carries_its_time_of_capture_in_the_vehicle_s_clock() -> None:
     one = relay()
     one.add_sample(sample(NOW - 30 * MS), LEVEL)
-    (pose,) = one.due(NOW, offset_ns=900 * SECOND, refused=())
+    (pose,) = one.due(NOW, offset_ns=900 * SECOND, refused=(), **STILL)
     assert pose == Pose("vision-position-estimate", 99_970_000, (1.0, 2.0, -0.5), LEVEL, None)
 
 
@@ -57,23 +59,23 @@ def test_nothing_goes_without_an_attitude_or_when_switched_off() -> None:
     one = relay()
     one.add_sample(sample(NOW), None)
     one.add_sample(sample(NOW), LEVEL)
-    assert one.due(NOW, offset_ns=NOW, refused=()) == ()  # before the vehicle's clock began
+    assert one.due(NOW, offset_ns=NOW, refused=(), **STILL) == ()  # before the vehicle's clock began
     assert kept(one) == {"no clock": 1, "no attitude": 1}
     off = Relay(RelayConfig())
     off.add_sample(sample(NOW), LEVEL)
-    assert off.due(NOW, offset_ns=0, refused=()) == ()
+    assert off.due(NOW, offset_ns=0, refused=(), **STILL) == ()
 
 
 def test_stale_late_and_refused_positions_stay_here() -> None:
     one = relay()
     one.add_sample(sample(NOW - MAX_AGE_NS - 1), LEVEL)
     one.add_sample(sample(NOW - 10 * MS, 1.0, 1.0, 0.0), LEVEL)
-    assert len(one.due(NOW, offset_ns=0, refused=())) == 1
+    assert len(one.due(NOW, offset_ns=0, refused=(), **STILL)) == 1
     one.add_sample(sample(NOW - 40 * MS, 1.1, 1.0, 0.0), LEVEL)  # captured before the one that went
-    assert one.due(NOW, offset_ns=0, refused=()) == ()
+    assert one.due(NOW, offset_ns=0, refused=(), **STILL) == ()
     refused = sample(NOW + 40 * MS, 1.2, 1.0, 0.0)
     one.add_sample(refused, LEVEL)
-    assert one.due(NOW + 50 * MS, offset_ns=0, refused=(refused,)) == ()
+    assert one.due(NOW + 50 * MS, offset_ns=0, refused=(refused,), **STILL) == ()
     assert kept(one) == {"old": 1, "out of order": 1, "refused": 1}
 
 
@@ -82,11 +84,11 @@ def test_a_frozen_pose_is_stuck_until_it_changes() -> None:
     for n in range(60):
         at_ns = NOW + n * 50 * MS
         one.add_sample(sample(at_ns, received_ns=at_ns), LEVEL)
-        sent += len(one.due(at_ns, offset_ns=0, refused=()))
+        sent += len(one.due(at_ns, offset_ns=0, refused=(), **STILL))
     assert (sent, kept(one)) == (FROZEN_POSES, {"frozen": 60 - FROZEN_POSES})
     at_ns = NOW + 60 * 50 * MS
     one.add_sample(sample(at_ns, 1.0, 2.0, -0.51, received_ns=at_ns), LEVEL)
-    assert len(one.due(at_ns, offset_ns=0, refused=())) == 1
+    assert len(one.due(at_ns, offset_ns=0, refused=(), **STILL)) == 1
 
 
 def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
@@ -95,7 +97,7 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
         at_ns = NOW + n * 10 * MS
         one.add_sample(sample(at_ns, n * 1e-3, 0.0, 0.0, received_ns=at_ns), LEVEL)
         if n % 10 == 9:
-            poses += one.due(at_ns, offset_ns=0, refused=())
+            poses += one.due(at_ns, offset_ns=0, refused=(), **STILL)
     stamps = [pose.usec for pose in poses]
     assert stamps == sorted(stamps) and 38 <= len(stamps) <= 41
 
@@ -103,8 +105,8 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
 def test_what_arrives_after_the_tick_waits_for_the_next() -> None:
     one = relay()
     one.add_sample(sample(NOW, received_ns=NOW + 1), LEVEL)
-    assert one.due(NOW, offset_ns=0, refused=()) == ()
-    assert len(one.due(NOW + 50 * MS, offset_ns=0, refused=())) == 1
+    assert one.due(NOW, offset_ns=0, refused=(), **STILL) == ()
+    assert len(one.due(NOW + 50 * MS, offset_ns=0, refused=(), **STILL)) == 1
 
 
 def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position() -> None:
@@ -112,13 +114,13 @@ def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position
     assert east is not None
     one = relay(message="odometry")
     one.add_sample(sample(NOW, velocity=(0.0, 2.0, 0.0)), east)
-    (pose,) = one.due(NOW, offset_ns=0, refused=())
+    (pose,) = one.due(NOW, offset_ns=0, refused=(), **STILL)
     assert pose.body_mps == pytest.approx((2.0, 0.0, 0.0))
     (message,) = read(Encoder(245, 25).encode_external_position(pose))
     assert (message.get_type(), message.frame_id, message.child_frame_id) == ("ODOMETRY", 20, 12)
     assert (message.x, message.y, message.z, message.vx) == pytest.approx((1.0, 2.0, -0.5, 2.0))
     one.add_sample(sample(NOW + SECOND, received_ns=NOW + SECOND), east)
-    (pose,) = one.due(NOW + SECOND, offset_ns=0, refused=())
+    (pose,) = one.due(NOW + SECOND, offset_ns=0, refused=(), **STILL)
     (message,) = read(Encoder(245, 25).encode_external_position(pose))
     assert message.get_type() == "VISION_POSITION_ESTIMATE"
     assert (message.roll, message.pitch, message.yaw) == pytest.approx((0.0, 0.0, math.pi / 2))

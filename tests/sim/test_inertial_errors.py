@@ -116,7 +116,8 @@ def test_the_estimate_tilts_by_the_bias_so_that_both_cancel_at_hover(heading_deg
     vehicle.set_heading(math.radians(heading_deg))
     vehicle.brake()
     run(vehicle, 4.0)
-    one = InertialSensors(replace(NONE, tilt_bias_mps2=0.1, drift_mps2=0.1), vehicle, seeded(5), flown=False)
+    errors = replace(NONE, tilt_bias_mps2=0.1, drift_mps2=0.1)
+    one = InertialSensors(errors, vehicle, seeded(5), lambda: 0.0, flown=False)
     told, attitude = one.measure(0), one.estimate_attitude()
     gravity = np.array([0.0, 0.0, G])
     biased = np.array(rotate_to_ned(vehicle.attitude, told.force_mps2)) + gravity
@@ -199,7 +200,7 @@ def test_the_wandering_tilt_is_for_flying() -> None:
     errors = replace(NONE, wander_rad=0.01)
     vehicle = quadrotor("px4", at=(0.0, 0.0, -1.0))
     vehicle.stand_on_floor()
-    one = InertialSensors(errors, vehicle, seeded(2), flown=False)
+    one = InertialSensors(errors, vehicle, seeded(2), lambda: 0.0, flown=False)
     one.measure(0)
     run(vehicle, 1.0)
     assert one.estimate_attitude() == pytest.approx(vehicle.attitude, abs=1e-12)
@@ -211,7 +212,7 @@ def test_the_wandering_tilt_is_for_flying() -> None:
 
 @BOTH
 def test_the_second_unit_has_errors_of_its_own(name: str) -> None:
-    one = InertialSensors(ERRORS[name].scale(1.0), quadrotor("px4"), seeded(6), flown=False)
+    one = InertialSensors(ERRORS[name].scale(1.0), quadrotor("px4"), seeded(6), lambda: 0.0, flown=False)
     first, second = one.measure(0), one.measure(1)
     assert first.force_mps2 != second.force_mps2
 

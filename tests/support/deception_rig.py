@@ -188,7 +188,12 @@ def _deceive_cameras(cameras: Cameras, deception: Deception) -> None:
 
 
 def fly_deceived(
-    config: Config, believed: Config, controller: Controller, deceptions: Sequence[Deception], blackout_s: float | None
+    config: Config,
+    believed: Config,
+    controller: Controller,
+    deceptions: Sequence[Deception],
+    blackout_s: float | None,
+    prepare: Callable[[World], None] = lambda _: None,
 ) -> DeceivedFlight:
     """Fly with sources that deceive.
 
@@ -196,6 +201,7 @@ def fly_deceived(
         config: Of the world.
         believed: Of the controller.
         blackout_s: When the blackout of the world begins; None for none.
+        prepare: Changes the world before the flight.
     """
     sink, flight = _CodeSink(), DeceivedFlight()
     modes: list[tuple[float, str]] = []
@@ -226,6 +232,7 @@ def fly_deceived(
 
     world = World(config, Watch())
     deceive(world, deceptions, lambda: time_s)
+    prepare(world)
     world.run(config.duration_s)
     flight.codes, flight.modes = sink.codes, modes
     flight.mode = world.peers.autopilot.mode_name

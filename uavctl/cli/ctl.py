@@ -17,6 +17,7 @@ from uavctl.cli.usage import format_example
 from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, find_control_folder
 from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
 from uavctl.errors import NotReachedError, UsageError
+from uavctl.mavlink.relay import REASONS
 from uavctl.records import Vec3
 
 ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
@@ -209,6 +210,8 @@ def describe_relay(relay: RelayHealth) -> str:
     if relay.last_s is None:
         return "no position has been passed on yet"
     suffix = "; control has ended, positions go on" if relay.alone else ""
+    if relay.attitude_fault:
+        suffix += f"; {REASONS.get(relay.attitude_fault, relay.attitude_fault)}"
     return f"{relay.sent_hz:.0f} positions a second, {relay.sent} in all, the last {relay.last_s:.1f} s ago{suffix}"
 
 

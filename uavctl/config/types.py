@@ -486,7 +486,7 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
             description="positions that the vehicle cannot have come to, and that agree for this long, are a source "
             "that moved: brake and land, and plans are not flown again [s]",
         ),
-    ] = 0.5
+    ] = 1.2
 
 
 class LimitsConfig(Section, frozen=True, kw_only=True):

@@ -49,6 +49,7 @@ class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
     last_s: float | None  # since the last one; None before the first
     alone: bool  # nothing else is sent any more: control has ended, or failed
     silent_for: str = ""  # reason why the vehicle has got none for half a second; empty while it gets them
+    attitude_fault: str = ""  # what is wrong with the attitude of poses, which are kept back; empty while it is right
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
@@ -233,6 +234,7 @@ class HealthMonitor:
             last_s=last_s,
             alone=stats.alone,
             silent_for=stats.silent_for,
+            attitude_fault=stats.attitude_fault,
         )
 
 
@@ -274,7 +276,8 @@ def _make_vehicle_health(vehicle: VehicleStatus, now_ns: int) -> VehicleHealth:
 
 def _format_relay(relay: RelayHealth) -> str:
     silent = f" SILENT ({relay.silent_for})" if relay.silent_for else ""
-    return f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}{silent}"
+    attitude = f" ATTITUDE ({relay.attitude_fault})" if relay.attitude_fault else ""
+    return f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}{silent}{attitude}"
 
 
 def _format_number(value: float | None, spec: str) -> str:

@@ -4,7 +4,8 @@ The monitors of single samples run here (frozen sources, outliers); all others r
 
 1. Inputs that begin to act are noted in the filter.
 2. A sample that is invalid is refused. Each other one is compared with what is known, in the order of capture: frozen
-   sources first, then outliers (`uavctl.flight.monitors`). What is refused is as good as lost.
+   sources first, then outliers, then jumps (`uavctl.flight.monitors`). What is refused is as good as lost. What counts
+   has the measured noise as standard deviation, and is less the shift of jumps.
 3. A source that is found to be frozen: its samples since then are dropped again.
 4. A source has moved while nobody flew on its positions: the filter begins anew.
 5. Inertial data of the tick update the filter, as their mean.
@@ -19,6 +20,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.estimator import (
@@ -38,7 +40,7 @@ from uavctl.flight.estimator import (
     update_inertial,
 )
 from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, read_capture_ns, read_measurement
-from uavctl.flight.monitors import frozen, outliers
+from uavctl.flight.monitors import frozen, jumps, noise, outliers
 from uavctl.flight.monitors.frozen import LastMotionNs, PredictedSample
 from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierObservation, OutlierTrack, Reach
@@ -81,8 +83,11 @@ def measure(state: ControlState, context: TickContext) -> Measured:
     history = estimator.history or begin_history(kalman, origin_ns, inputs.at_ns)
     history, pending_inputs = apply_due_inputs(history, estimator.pending_inputs, inputs.at_ns)
     is_due = is_mark_due(kalman, history, inputs.at_ns)
+    sources = estimator.sources
+    if not context.was_in_control:
+        sources = replace(sources, jumps=jumps.suspend(sources.jumps, inputs.at_ns))
     samples = gate_samples(
-        kalman, controller.reach, history, estimator.sources, inputs, controller.horizon, estimator.consecutive_samples
+        kalman, controller.reach, history, sources, inputs, controller.horizon, estimator.consecutive_samples
     )
     restarted = samples.source_moved and not context.was_in_control
     if restarted:
@@ -180,8 +185,10 @@ def _gate_in_order(
         if history.captured_ns is None:
             first = frozen.track_sample(sources.tracks, kalman, history, sample, np.zeros(len(kalman.axes)))
             sources = replace(sources, tracks=first)
+        sources = replace(sources, jumps=jumps.note_position(sources.jumps, at_ns))
+        counted = _prepare_sample(sources, sample, at_ns)
         if belief is not None:  # else it is the first one, or too old
-            sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, belief)
+            sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, counted, belief)
             if verdict.cause is not None:
                 code = verdict.cause.value
                 if verdict.since_ns is not None:
@@ -193,9 +200,12 @@ def _gate_in_order(
                     accepted = [other for other in accepted if not is_distrusted(other)]
                 refused.append((sample, code))
                 continue
-        history, reason = insert_sample(kalman, history, sample, belief)
+            counted = _prepare_sample(sources, sample, at_ns)
+        history, reason = insert_sample(kalman, history, counted, belief)
         if reason is None:
-            accepted.append(sample)
+            if belief is None:
+                sources = replace(sources, noise=noise.update(sources.noise, sample, at_ns))
+            accepted.append(counted)
         else:
             refused.append((sample, reason))
     sources = replace(sources, absurd=_track_absurd(sources.absurd, kalman, bool(accepted), refused))
@@ -253,11 +263,18 @@ def _judge_sample(
     sources: SourceHealth,
     inputs: StepInput,
     sample: PositionSample,
+    counted: PositionSample,
     belief: Belief,
 ) -> tuple[SourceHealth, Verdict]:
-    """Compare a sample with what is known; `belief` is the prediction for its capture time."""
+    """Compare a sample with what is known.
+
+    Args:
+        sample: The sample as it came.
+        counted: The same with the noise that positions have, less their jumps.
+        belief: The prediction for its capture time.
+    """
     at_ns, n_axes = read_capture_ns(sample), len(kalman.axes)
-    values, variances = read_measurement(kalman, sample)
+    values, variances = read_measurement(kalman, replace(counted, std_m=sample.std_m))
     # ν = y - H z
     offset = values - belief.mean[kalman.measured_index[: len(values)]]
     observation = PredictedSample(
@@ -274,11 +291,40 @@ def _judge_sample(
         if at_ns > (history.captured_ns or at_ns):
             error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
             sources = replace(sources, velocity_error_mps=error_mps)
-        return replace(sources, outliers=outlier_track), NO_VERDICT
+        sources = replace(sources, outliers=outlier_track, noise=noise.update(sources.noise, sample, at_ns))
+        if not sources.noise.is_known:
+            return sources, NO_VERDICT
+        return _judge_jump(kalman, sources, offset, _prepare_sample(sources, sample, at_ns), belief)
     if frozen.is_repeat(tracks[sample.source], at_ns):
         # A value that came before did not jump: the prediction has moved away from a source that is frozen.
         return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN)
     return replace(sources, outliers=outlier_track), verdict
+
+
+def _prepare_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -> PositionSample:
+    """Return a sample with the noise that positions have, less their jumps."""
+    std_m, shift_m = max(sample.std_m, sources.noise.std_m), sources.jumps.compute_shift_m(at_ns)
+    if std_m == sample.std_m and not any(shift_m):
+        return sample
+    north, east, down = (p - s for p, s in zip(sample.position_m, shift_m, strict=True))
+    return replace(sample, position_m=(north, east, down), std_m=std_m)
+
+
+def _judge_jump(
+    kalman: Kalman, sources: SourceHealth, offset: Array, counted: PositionSample, belief: Belief
+) -> tuple[SourceHealth, Verdict]:
+    """Judge whether a sample inside the gate belongs to another solution of the camera system."""
+    at_ns, n_axes = read_capture_ns(counted), len(kalman.axes)
+    index, offset_m = kalman.measured_index[:n_axes], [0.0, 0.0, 0.0]
+    for axis, value in zip(kalman.axes, offset.tolist(), strict=False):
+        offset_m[axis] = value
+    # √(H P H' + R)
+    spread_m = np.sqrt(belief.cov[index, index] + read_measurement(kalman, counted)[1][:n_axes])
+    north, east, down = offset_m
+    age_s = (at_ns - belief.captured_ns) * 1e-9
+    track, is_refused = jumps.update(sources.jumps, (north, east, down), spread_m, at_ns, age_s)
+    sources = replace(sources, jumps=track)
+    return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_JUMP) if is_refused else NO_VERDICT
 
 
 def _is_flying(vehicle: VehicleStatus | None) -> bool:

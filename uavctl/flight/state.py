@@ -14,6 +14,8 @@ from uavctl.flight.mission import MissionState
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import ExternalState
 from uavctl.flight.monitors.frozen import LastMotionNs, SourceTracks
+from uavctl.flight.monitors.jumps import JumpTrack
+from uavctl.flight.monitors.noise import NoiseTrack
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Command, ControlMode, Plan, Vec3
@@ -28,6 +30,8 @@ class SourceHealth(msgspec.Struct, frozen=True, eq=False):
     # Bound of the velocity's error, each axis of the plant [m/s]; None before the first sample
     velocity_error_mps: Array | None = None
     tracks: SourceTracks = msgspec.field(default_factory=dict)  # what each source has shown
+    noise: NoiseTrack = NoiseTrack()  # noise of positions that were believed
+    jumps: JumpTrack = JumpTrack()  # jumps between two solutions
     last_motion_ns: LastMotionNs = (0, 0, 0)  # when the vehicle last moved, each axis, by its own velocity
 
 

@@ -65,8 +65,17 @@ def _parse_attitude(raw: MessageFields) -> Attitude | None:
     if not all(map(math.isfinite, angles)):
         return None
     return Attitude(
-        system=raw.src_system, component=raw.src_component, angles_rad=angles, stamp_us=1000 * raw.time_boot_ms
+        system=raw.src_system,
+        component=raw.src_component,
+        angles_rad=angles,
+        rates_rps=_parse_rates(raw),
+        stamp_us=1000 * raw.time_boot_ms,
     )
+
+
+def _parse_rates(raw: MessageFields) -> Vec3 | None:
+    rates_rps = (raw.rollspeed, raw.pitchspeed, raw.yawspeed)
+    return rates_rps if all(map(math.isfinite, rates_rps)) else None
 
 
 def _parse_attitude_quaternion(raw: MessageFields) -> Attitude | None:
@@ -77,6 +86,7 @@ def _parse_attitude_quaternion(raw: MessageFields) -> Attitude | None:
         system=raw.src_system,
         component=raw.src_component,
         angles_rad=euler_from_quaternion(attitude),
+        rates_rps=_parse_rates(raw),
         quaternion=True,
         stamp_us=1000 * raw.time_boot_ms,
     )

@@ -333,7 +333,9 @@ class MavlinkConnection:
         # Only PX4 moves stamps by its offset to our time. That offset is zero if we answer with its own time.
         moves_stamps = not self._uses_vehicle_time and self._vehicle.autopilot == "px4"
         offset_ns = 0 if moves_stamps else self._vehicle_offset_ns(at_ns) or 0
-        poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
+        poses = relay.due(
+            at_ns, offset_ns=offset_ns, refused=refused, turn=self._vehicle.turn, armed=self._vehicle.is_armed
+        )
         return tuple(self._encoder.encode_external_position(pose) for pose in poses)
 
     def _vehicle_time_ns(self, at_ns: int) -> int | None:

@@ -109,6 +109,7 @@ class Attitude(Message, frozen=True, kw_only=True):
     """ATTITUDE or ATTITUDE_QUATERNION."""
 
     angles_rad: Vec3  # roll, pitch, yaw of body axes forward, right, down in NED
+    rates_rps: Vec3 | None = None  # body rates about forward, right, down; None if not finite
     quaternion: bool = False  # it is ATTITUDE_QUATERNION
     stamp_us: int = 0  # by the sender's clock, since boot; 0 if unknown
 

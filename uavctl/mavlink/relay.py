@@ -1,8 +1,9 @@
 """Relay of positions to the vehicle's own estimator: selection and time stamps. Pure; time is an argument.
 
-1. Keep back positions that are refused, old, frozen, out of order or too frequent; count each by reason.
+1. Keep back positions that are refused, old, frozen, out of order, too frequent, or whose attitude is wrong; count
+   each by reason.
 2. Convert the capture time to the vehicle's clock: by its TIMESYNC answers, or else by the arrival of its messages.
-3. Report silence with its reason.
+3. Report silence and a wrong attitude, with the reason.
 
 PX4 also requests our time and moves the stamps that it receives by the offset that it finds
 (src/lib/timesync/Timesync.cpp, `sync_stamp`). We answer with the time of its own clock, so that offset is zero. An
@@ -11,13 +12,15 @@ unknown clock never stops the positions. An estimator tolerates a small error of
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from uavctl.config.connections import RelayConfig
 from uavctl.event_codes import EventCode
 from uavctl.frames import Quaternion, rotate_vector
+from uavctl.mavlink.relay_attitude import TILTED, TURNED, AttitudeCheck
+from uavctl.mavlink.vehicle_turn import VehicleTurn
 from uavctl.records import Event, PositionSample, Severity, Vec3
 
 MAX_AGE_NS = 200_000_000  # some estimators use an older position as a new one
@@ -36,7 +39,11 @@ REASONS = {
     "out of order": "positions come that are older than those before",
     "rate": "stamps of positions do not go on",
     "no clock": "stamps of positions are from before the vehicle's start",
+    TILTED: "poses are tilted otherwise than the vehicle",
+    TURNED: "poses turn otherwise than the vehicle",
 }
+WRONG_ATTITUDES = 5  # poses with a wrong attitude within `ATTITUDE_NS`: a fault, and no outlier
+ATTITUDE_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,7 @@ class Relay:
         last_ns: time of the tick that passed the last one on; None before.
         kept: poses that were kept back, by reason.
         silent_for: reason why the vehicle gets no position now, a key of `REASONS`; empty while it gets them.
+        attitude_fault: what is wrong with the attitude of poses now, a key of `REASONS`; empty while it is right.
     """
 
     def __init__(self, config: RelayConfig) -> None:
@@ -74,7 +82,12 @@ class Relay:
         self.silent_for = ""
         self.sent = 0
         self.last_ns: int | None = None
-        self.kept = dict.fromkeys(("no attitude", "refused", "old", "frozen", "out of order", "rate", "no clock"), 0)
+        self.kept = dict.fromkeys(
+            ("no attitude", "refused", "old", "frozen", "out of order", "rate", "no clock", TILTED, TURNED), 0
+        )
+        self.attitude_fault = ""
+        self._attitude_check = AttitudeCheck()
+        self._wrong_attitudes: deque[tuple[int, str]] = deque(maxlen=WRONG_ATTITUDES)  # last ones: time, and fault
 
     @property
     def is_enabled(self) -> bool:
@@ -91,12 +104,16 @@ class Relay:
         self._queue.append((sample, attitude))
         del self._queue[:-_MAX_QUEUE]
 
-    def due(self, at_ns: int, *, offset_ns: int, refused: Sequence[PositionSample]) -> tuple[Pose, ...]:
+    def due(
+        self, at_ns: int, *, offset_ns: int, refused: Sequence[PositionSample], turn: VehicleTurn, armed: bool
+    ) -> tuple[Pose, ...]:
         """Return the poses for the vehicle in this tick, in order of capture.
 
         Args:
             offset_ns: (our time - the vehicle's), by which stamps are moved.
             refused: samples that the tick has refused.
+            turn: tilt and turn of the vehicle by its own sensors.
+            armed: the vehicle may be in the air.
         """
         arrived = [entry for entry in self._queue if entry[0].received_ns <= at_ns]
         self._queue = [entry for entry in self._queue if entry[0].received_ns > at_ns]
@@ -106,6 +123,8 @@ class Relay:
             reason = "refused" if sample in refused else self._find_reason(sample, attitude, at_ns)
             if reason is None and sample.captured_ns - offset_ns < 1000:
                 reason = "no clock"  # before the vehicle's clock began
+            if reason is None:
+                reason = self._find_attitude_fault(sample, attitude, at_ns, turn, armed=armed)
             if reason is not None:
                 self.kept[reason] += 1
                 continue
@@ -149,6 +168,22 @@ class Relay:
         text = f"the vehicle gets no position since {(at_ns - since_ns) * 1e-9:.1f} s: {REASONS[self.silent_for]}"
         return Event(at_ns=at_ns, severity=Severity.WARNING, code=EventCode.RELAY_SILENT, text=text)
 
+    def make_attitude_event(self, at_ns: int) -> Event | None:
+        """Return an event if poses begin to have a wrong attitude, or have a right one again for `ATTITUDE_NS`."""
+        wrong = self._wrong_attitudes
+        is_over = not wrong or at_ns - wrong[-1][0] >= ATTITUDE_NS
+        is_wrong = len(wrong) == WRONG_ATTITUDES and wrong[-1][0] - wrong[0][0] <= ATTITUDE_NS and not is_over
+        if is_wrong and not self.attitude_fault:
+            self.attitude_fault = fault = wrong[-1][1]
+            text = f"{REASONS[fault]}; they are not passed on to it"
+            severity, code = Severity.WARNING, EventCode.RELAY_ATTITUDE
+            return Event(at_ns=at_ns, severity=severity, code=code, text=text, subject=fault)
+        if is_over and self.attitude_fault and self.last_ns is not None and self.last_ns > wrong[-1][0]:
+            self.attitude_fault = ""
+            text = "the attitude of poses is right again; they are passed on"
+            return Event(at_ns=at_ns, severity=Severity.INFO, code=EventCode.RELAY_ATTITUDE_RIGHT, text=text)
+        return None
+
     def _find_silence_reason(self) -> str:
         counts = (Counter(self.kept) - self._kept_before).most_common(1)
         return counts[0][0] if counts else NO_POSITION
@@ -167,6 +202,14 @@ class Relay:
         if newest_ns is not None and sample.captured_ns - newest_ns < self._period_ns - self._period_ns // 10:
             return "rate"
         return None
+
+    def _find_attitude_fault(
+        self, sample: PositionSample, attitude: Quaternion, at_ns: int, turn: VehicleTurn, *, armed: bool
+    ) -> str | None:
+        fault = self._attitude_check.find_fault(sample.captured_ns, attitude, turn, armed=armed)
+        if fault is not None:
+            self._wrong_attitudes.append((at_ns, fault))
+        return fault
 
     def _make_pose(self, sample: PositionSample, attitude: Quaternion, offset_ns: int) -> Pose:
         velocity_body = None

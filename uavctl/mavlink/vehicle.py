@@ -34,6 +34,7 @@ from uavctl.mavlink.messages import (
 )
 from uavctl.mavlink.mode_reason import ModeReasonEvidence
 from uavctl.mavlink.profile import PROFILES, describe_mode, find_autopilot_name
+from uavctl.mavlink.vehicle_turn import VehicleTurn
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 
 # Identical readings for longer come from a frozen sensor. Whole thousandths of g repeat for 0.7 s at most in recorded
@@ -154,6 +155,7 @@ class VehicleMonitor:
         self._motion = VehicleMotion()
         self._sensor_streams: dict[str, SensorStreamMonitor] = {}  # by kind of message
         self._attitude: tuple[Vec3, int] | None = None  # attitude, and its time of arrival
+        self.turn = VehicleTurn()  # by all attitude messages
         self.inertial_used = self.inertial_total = 0  # inertial data: used, and all
         self.boots = 0
         self.not_ready_count = 0  # times that it was no longer ready: its streams may have stopped
@@ -202,6 +204,8 @@ class VehicleMonitor:
                 status = self._update_boot_clock("position", stamp_us, at_ns)
                 return (*status, *self._update_motion(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad):
+                if message.rates_rps is not None:
+                    self.turn.add(angles_rad, message.rates_rps, message.stamp_us, at_ns)
                 kind = "quaternion" if message.quaternion else "angles"
                 status = self._update_boot_clock(kind, message.stamp_us, at_ns) if message.stamp_us else ()
                 # Inertial data use both attitude messages. Without them, one of two streams is enough.

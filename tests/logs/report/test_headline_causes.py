@@ -238,6 +238,7 @@ def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: boo
         ("sample-future", Cause.STAMPS_UNUSABLE),
         ("sample-invalid", Cause.POSITIONS_INVALID),
         ("relay-silent", Cause.RELAY_SILENT),
+        ("relay-attitude", Cause.RELAY_ATTITUDE),
         ("second-vehicle", Cause.SECOND_VEHICLE),
     ],
 )

@@ -25,15 +25,17 @@ from msgspec.structs import replace
 from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import Motion, PositionObservation
+from uavctl.flight.monitors.noise import LARGEST_STD_M
 from uavctl.flight.monitors.observation import MOTION_NS, describe_vector
-from uavctl.flight.monitors.observer import Observer, measure_size_mps2, remove_drag
+from uavctl.flight.monitors.observer import POSITION_STD_M, Observer, measure_size_mps2, remove_drag
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import VehicleMotion
 
 SCATTERED, OF = 3, 5  # clipped innovations among the last ones that are no chance
 PERSISTS_NS = 100_000_000  # time for which it has to last, over two positions at least
 PLAIN = 1.5  # this many times the bound is beyond it at once
-KNOWN = 1.5  # it counts from so many of its standard deviations on
+KNOWN = 1.5  # it counts from so many of its standard deviations on,
+KNOWN_NOISY = 4.0  # and from so many where positions are noisier than usual: chance alone makes two of them
 HINT = 0.4  # of the bound: a hint for the comparison of velocities
 QUIET = 0.5  # of the bound: below it, positions are clean
 GRAVITY_MPS2 = 9.81
@@ -71,7 +73,8 @@ def update(state: AccelerationState, observation: PositionObservation) -> tuple[
     is_pushed, beside_mps2 = _explain_push(state, observation.motion, beside_sent_mps2, bound_mps2)
     ratio = beside_mps2 / bound_mps2
     # |d| > 1.5 √P_dd
-    known = beside_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
+    sigma = KNOWN_NOISY if POSITION_STD_M < observation.std_m <= LARGEST_STD_M else KNOWN
+    known = beside_mps2 > sigma * math.sqrt(observer.cov[2, 2])
     over_ns = (state.over_ns or observation.at_ns) if ratio > 1.0 and known else None
     clipped = (*state.clipped, observation.is_clipped)[-OF:]
     state = AccelerationState(beside_sent_mps2, ratio, clipped, is_pushed, over_ns)

@@ -72,6 +72,7 @@ class PositionObservation(msgspec.Struct, frozen=True, eq=False):
     observer: Observer
     tick: Observation
     parameters: EnvelopeParameters
+    std_m: float = 0.0  # its standard deviation
     is_hinted: bool = False  # whether the acceleration already hints at something amiss
 
 
@@ -168,7 +169,9 @@ def take_position(
         north, east, down = (observer.mean[2] - observer.inertial[2]).tolist()
         push = north, east, down
     motion = replace(motion, observer=observer, push_mps2=push)
-    return motion, PositionObservation(at_ns, position, False, is_clipped, motion, observer, tick, parameters)
+    return motion, PositionObservation(
+        at_ns, position, False, is_clipped, motion, observer, tick, parameters, sample.std_m
+    )
 
 
 def _predict(observer: Observer, motion: Motion, at_ns: int, parameters: EnvelopeParameters) -> Observer:

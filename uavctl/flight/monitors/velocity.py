@@ -24,6 +24,7 @@ from msgspec.structs import replace
 from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import PositionObservation, TickObservation, find_distance
+from uavctl.flight.monitors.noise import USUAL_STD_M
 from uavctl.flight.monitors.observation import EnvelopeParameters, describe_vector
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vector
@@ -40,6 +41,7 @@ PLACES_NS, PLACE_NS = 30_000_000_000, 1_000_000_000  # mean offsets are compared
 # Of the disagreement: the bound of a change of offset begins with so many seconds of it, and grows by such a part.
 DRIFT_S, DRIFT_PART = 2.0, 0.16
 LEAST_OFFSETS = 3  # for a slope
+NOISE_SIGMA = 4.0  # standard deviations of a slope that chance may make
 _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
 
 Offsets = tuple[
@@ -82,10 +84,11 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, points, parameters)
     apart = _remove_delay(slope, path, offsets)
     apart_mps = math.hypot(*apart)
-    is_contradicted = apart_mps > parameters.disagreement_mps
+    bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, observation.std_m)
+    is_contradicted = apart_mps > bound_mps
     apart_ns = (state.apart_ns or at_ns) if is_contradicted and not corrects else None
     state = VelocityState(offsets, places, apart_mps, is_contradicted, apart_ns)
-    plain = observation.is_hinted or apart_mps >= PLAIN * parameters.disagreement_mps
+    plain = observation.is_hinted or apart_mps >= PLAIN * bound_mps
     if apart_ns is not None and (plain or at_ns - apart_ns >= PERSISTS_NS):
         text = f"positions move otherwise than the vehicle itself says, by {describe_vector(apart)} m/s"
         return state, end_plans(EventCode.VELOCITY, text)
@@ -147,6 +150,15 @@ def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) 
     centred = times_s - np.add.reduce(times_s) / len(times_s)
     slope: Array = centred @ points / float(centred @ centred)
     return slope
+
+
+def _bound_noise_mps(offsets: Offsets, std_m: float) -> float:
+    """Bound the slope [m/s] that noise makes, where positions are noisier than usual."""
+    if std_m <= USUAL_STD_M:
+        return 0.0
+    mean_ns = sum(at_ns - offsets[0][0] for at_ns, _ in offsets) / len(offsets)
+    # 4 σ / √Σ (t_i - t̄)²
+    return NOISE_SIGMA * std_m / math.hypot(*((at_ns - offsets[0][0] - mean_ns) * 1e-9 for at_ns, _ in offsets))
 
 
 def _remove_delay(apart: Array, path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> Array:

@@ -1,0 +1,35 @@
+"""Everyday faults of cameras whose positions are right on the whole: flown through between walls, in gusts."""
+
+from __future__ import annotations
+
+import pytest
+from camera_faults_rig import fly_with_fault
+
+from uavctl.flight.supervise import ENVELOPE_CODES
+from uavctl.records import ControlMode
+
+pytestmark = pytest.mark.slow
+PAIRS = [("room", "px4"), ("room", "ardupilot"), ("room-px4", "px4"), ("room-ardupilot", "ardupilot")]
+
+
+@pytest.mark.fault(100)
+@pytest.mark.parametrize(("preset", "autopilot"), PAIRS)
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("two-10cm", 1),
+        ("two-20cm", 2),
+        ("two-30cm", 22),
+        ("burst-apart", 21),
+        ("burst-together", 1),
+        ("heavy-3cm", 1),
+        ("white-5cm", 22),
+        ("average", 12),
+    ],
+)
+def test_a_camera_fault_is_flown_through(kind: str, seed: int, preset: str, autopilot: str) -> None:
+    flight = fly_with_fault(kind, seed, preset, autopilot)
+    assert flight.codes is not None and flight.modes is not None
+    assert not flight.codes.keys() & ENVELOPE_CODES
+    assert flight.modes[-1][1] in (ControlMode.TRACK, ControlMode.BRAKE)
+    assert flight.outside_m < 0.5

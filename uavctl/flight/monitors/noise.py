@@ -1,0 +1,61 @@
+"""Monitor: how noisy are positions? It refuses none, but says how much each one counts.
+
+1. Each position is compared with the line between its neighbours in time. The median of such residuals is the noise:
+   neither a jump nor a burst of outliers changes a median, and no acceleration bends a path by so much.
+2. A position counts with that standard deviation where it is larger than what is usual.
+
+Frames that are wrong make smooth errors, which do not change the noise.
+"""
+
+from __future__ import annotations
+
+import math
+from statistics import median
+
+import msgspec
+
+from uavctl.records import PositionSample, Vec3
+
+USUAL_STD_M = 0.012  # up to here noise is usual: bounds of other monitors include it
+LARGEST_STD_M = 0.1  # larger noise is none of a camera system that works
+_RESIDUALS, _LEAST_RESIDUALS = 15, 3  # a second or so at 20 Hz
+# Neighbours whose distances in time have a larger product are too far apart: 4 m/s² bend a path by 0.02 m within it.
+_LARGEST_S2 = 0.01
+_MEDIAN_3D = 1.538  # median length of a vector of three independent values with standard deviation 1
+
+
+class NoiseTrack(msgspec.Struct, frozen=True):
+    """Last positions of all sources, and what they have shown."""
+
+    last: tuple[tuple[int, Vec3], ...] = ()  # up to two: capture time [ns], position [m]
+    residuals_m: tuple[float, ...] = ()  # newest last, scaled to the noise of a single position
+
+    @property
+    def is_known(self) -> bool:
+        """Whether positions have come close enough to one another, and for long enough."""
+        return len(self.residuals_m) >= _LEAST_RESIDUALS
+
+    @property
+    def std_m(self) -> float:
+        """Standard deviation of a position, each axis [m]; 0 where it is not known or usual."""
+        if not self.is_known:
+            return 0.0
+        std_m = median(self.residuals_m) / _MEDIAN_3D
+        return min(std_m, LARGEST_STD_M) if std_m > USUAL_STD_M else 0.0
+
+
+def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
+    """Take a position that was accepted; one that is older than those before shows nothing."""
+    if track.last and at_ns <= track.last[-1][0]:
+        return track
+    last, residuals_m = (*track.last, (at_ns, sample.position_m)), track.residuals_m
+    if len(last) == 3:
+        (begin_ns, begin_m), (middle_ns, middle_m), (end_ns, end_m) = last
+        before_s, after_s = (middle_ns - begin_ns) * 1e-9, (end_ns - middle_ns) * 1e-9
+        if before_s * after_s <= _LARGEST_S2:
+            # r = p - ((1 - c) p_0 + c p_1), whose variance is (1 + (1 - c)² + c²) σ²
+            c = before_s / (before_s + after_s)
+            away_m = [m - (1.0 - c) * b - c * e for b, m, e in zip(begin_m, middle_m, end_m, strict=True)]
+            residual_m = math.hypot(*away_m) / math.sqrt(1.0 + (1.0 - c) ** 2 + c * c)
+            residuals_m = (*residuals_m, residual_m)[-_RESIDUALS:]
+    return NoiseTrack(last[-2:], residuals_m)
