@@ -5,12 +5,15 @@ Messages go through a pair of sockets that keeps message bounds. While the proce
 
 from __future__ import annotations
 
+import io
 import secrets
 import socket
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 
 from logs.live.feed import LARGEST, pack
 from logs.recording.topics import parse_raw_topic
@@ -18,6 +21,7 @@ from uavctl.errors import UsageError
 
 HOST = "127.0.0.1"
 BACKLOG = 16  # connections that wait until the process accepts them
+BUFFER_BYTES = 262_144  # of the system for each connection and direction; by itself it takes megabytes
 _END_S = 2.0  # for the process to end by itself
 
 
@@ -32,6 +36,8 @@ def open_port(port: int) -> socket.socket:
     listener = socket.socket()
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after an earlier flight, at once
+        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):  # accepted connections inherit them
+            listener.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
         listener.bind((HOST, port))
         listener.listen(BACKLOG)
     except OSError as error:
@@ -66,24 +72,10 @@ class LiveProcess:
         self._on_death, self._is_closed = on_death, False
         with open_port(port) as listener:
             self.port: int = listener.getsockname()[1]
-            self._socket, peer = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LARGEST)
-            self._socket.setblocking(False)
-            numbers = (peer.fileno(), listener.fileno())
-            with peer:
-                try:
-                    self._process = subprocess.Popen(
-                        [sys.executable, "-P", "-m", "logs.live.host", *map(str, numbers)],
-                        pass_fds=numbers,
-                        stdin=subprocess.DEVNULL,
-                        stdout=subprocess.DEVNULL,
-                        stderr=subprocess.DEVNULL,  # a console that nobody reads would hold it up
-                        start_new_session=True,  # an interrupt is for the flight
-                    )
-                except OSError as error:  # no memory, or too many processes
-                    self._socket.close()
-                    raise UsageError(f"live view: its process cannot be started ({error.strerror})") from error
-        self._socket.send(self.token.encode())  # other users can read the arguments of a process
+            try:
+                self._socket, self._process = _start(listener, self.token)
+            except OSError as error:  # no memory, no descriptor, or too many processes
+                raise UsageError(f"live view: its process cannot be started ({error.strerror})") from error
         threading.Thread(target=self._wait_for_end, name="live view's end", daemon=True).start()
 
     def send(self, topic: str, at_ns: int, data: bytes) -> None:
@@ -110,6 +102,35 @@ class LiveProcess:
             self._process.wait()
 
     def _wait_for_end(self) -> None:
+        with self._process.stderr or io.BytesIO() as errors:
+            last_words = b"".join(deque(errors, maxlen=1)).decode(errors="replace").strip()
         code = self._process.wait()
         if not self._is_closed:
-            self._on_death(f"signal {-code}" if code < 0 else f"exit code {code}")
+            self._on_death(f"signal {-code}" if code < 0 else last_words or f"exit code {code}")
+
+
+def _start(listener: socket.socket, token: str) -> tuple[socket.socket, subprocess.Popen[bytes]]:
+    """Start the process; return the flight's end of the pair of sockets and the process.
+
+    Raises:
+        OSError: The system does not allow that now.
+    """
+    own, peer = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ExitStack() as stack:
+        stack.callback(own.close)
+        stack.enter_context(peer)
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LARGEST)
+        own.setblocking(False)
+        own.send(token.encode())  # other users can read the arguments of a process
+        numbers = (peer.fileno(), listener.fileno())
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "logs.live.host", *map(str, numbers)],
+            pass_fds=numbers,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,  # read by the thread that waits for the end
+            start_new_session=True,  # an interrupt is for the flight
+        )
+        peer.close()
+        stack.pop_all()
+    return own, process

@@ -30,6 +30,13 @@ def make_head(headers: Mapping[str, str], path: str = "/", method: str = "GET") 
     return "\r\n".join([f"{method} {path} HTTP/1.1", *(f"{n}: {v}" for n, v in headers.items()), "", ""]).encode()
 
 
+def make_frame(data: bytes, opcode: int = TEXT) -> bytes:
+    """A client's frame of 126 to 65,535 bytes, or of less in the longer form."""
+    mask = os.urandom(4)
+    head = bytes([0x80 | opcode, 0x80 | 126]) + len(data).to_bytes(2, "big")
+    return head + mask + bytes(byte ^ mask[i % 4] for i, byte in enumerate(data))
+
+
 def ask(port: int, request: bytes) -> tuple[int, bytes]:
     """Status and body of the answer to a request; of an upgrade, status and nothing."""
     with socket.create_connection(("127.0.0.1", port), timeout=LIMIT_S) as client:
@@ -109,9 +116,7 @@ class Viewer:
         self._socket.sendall(data)
 
     def _send(self, data: bytes, opcode: int = TEXT) -> None:
-        mask = os.urandom(4)
-        head = bytes([0x80 | opcode, 0x80 | 126]) + len(data).to_bytes(2, "big")
-        self._socket.sendall(head + mask + bytes(byte ^ mask[i % 4] for i, byte in enumerate(data)))
+        self._socket.sendall(make_frame(data, opcode))
 
     def _take(self, count: int) -> bytes:
         while len(self._buffer) < count:

@@ -272,6 +272,22 @@ def test_97_a_process_that_is_killed_is_told_once_and_its_messages_are_dropped()
     assert deaths == ["signal 9"]
 
 
+@pytest.mark.fault(97)
+@pytest.mark.parametrize(("last_line", "cause"), [("echo no memory >&2", "no memory"), ("", "exit code 3")])
+def test_97_a_process_that_cannot_start_is_told_with_its_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last_line: str, cause: str
+) -> None:
+    program, deaths = tmp_path / "python", list[str]()
+    program.write_text(f"#!/bin/sh\n{last_line}\nexit 3\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(program))
+    live = LiveProcess(0, deaths.append)
+    wait_until(lambda: bool(deaths), "the death is told")
+    live.send(EVENT, 0, b"{}")
+    live.close()
+    assert deaths == [cause]
+
+
 def test_an_end_in_order_is_no_death() -> None:
     deaths: list[str] = []
     with serving(deaths) as live, Viewer(live.port, receive_bytes=4096):
