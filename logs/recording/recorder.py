@@ -10,10 +10,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Protocol
 
 import msgspec
@@ -23,12 +22,12 @@ from logs.recording.disk import DiskFile, FreeSpaceMonitor, OutputFile, find_lat
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader
 from logs.recording.segment import Rotation
-from logs.recording.topics import HEADER, RECORDER, Definition, encode, encode_message, get_definition
+from logs.recording.topics import HEADER, RECORDER, encode, encode_message
 from uavctl.config.types import LogConfig
-from uavctl.errors import RecordingError, UsageError, need
+from uavctl.errors import RecordingError
 from uavctl.records import Datagram, Header, Record
 
-Watcher = Callable[[Definition, int, bytes], None]
+Watcher = Callable[[str, int, bytes], None]
 
 
 class ViewMaker(Protocol):
@@ -44,22 +43,16 @@ class DerivedTopics:
 
     Args:
         views: makes the messages for viewers; None: there are none.
-        watch: is given definition, log time [ns] (that of the file) and bytes of each message, soon after its record
-            was taken; returns at once and raises nothing.
-        look: is given each record then, the same way.
+        watch: is given topic, log time [ns] (that of the file) and bytes of each message, soon after its record was
+            taken; returns at once and raises nothing.
 
     Attributes:
         unseen: number of records that no messages for viewers could be made of; the recording has them.
         reason: why, for the newest of them.
     """
 
-    def __init__(
-        self,
-        views: ViewMaker | None = None,
-        watch: Watcher | None = None,
-        look: Callable[[Record], None] = lambda _: None,
-    ) -> None:
-        self._views, self._watch, self._look = views, watch, look
+    def __init__(self, views: ViewMaker | None = None, watch: Watcher | None = None) -> None:
+        self._views, self._watch = views, watch
         self._zero_utc_ns = 0
         self.unseen = 0
         self.reason = ""
@@ -69,13 +62,12 @@ class DerivedTopics:
         if isinstance(record, Header):
             self._zero_utc_ns = record.zero_utc_ns or 0
         messages = [(name, at_ns, view) for name, view in self._derive_views(at_ns, record)]
-        try:
-            self._look(record)
-            if self._watch is not None:
+        if self._watch is not None:
+            try:
                 for name, time_ns, message in ((topic, at_ns, data), *messages):
-                    self._watch(get_definition(name), time_ns + self._zero_utc_ns, message)
-        except Exception as error:  # noqa: BLE001 who looks on ends no recording
-            self._note_unseen(record, error)
+                    self._watch(name, time_ns + self._zero_utc_ns, message)
+            except Exception as error:  # noqa: BLE001 who looks on ends no recording
+                self._note_unseen(record, error)
         return messages
 
     def _derive_views(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
@@ -355,65 +347,6 @@ class WriteQueue:
             self._files.finish(attachments.make_parameter_attachments(self._parameters, utc_ns))
         except OSError as error:
             self._files.fail(error)
-
-
-HOST = "127.0.0.1"
-BACKLOG = 1024  # messages: about four seconds of a flight
-STOP_S = 1.0  # for viewers to take their leave
-
-
-@contextmanager
-def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: None) -> Iterator[Watcher | None]:
-    """Serve every message that the watcher is given to viewers, without raw bytes.
-
-    Args:
-        port: TCP port on the loopback address, 0 for a free one; None: nobody looks, and nothing is imported.
-        on_open: called with the port once viewers can connect.
-
-    Raises:
-        ExtraMissingError: foxglove-sdk is not installed.
-        UsageError: The port cannot be had.
-    """
-    if port is None:
-        yield None
-        return
-    if not 0 <= port <= 65535:
-        raise UsageError(f"--live-port {port}: ports are 1 to 65535; 0 takes one that is free")
-    foxglove = need("foxglove", "live")
-    context = foxglove.Context()
-    try:
-        server = foxglove.start_server(
-            name="uavctl", host=HOST, port=port, context=context, message_backlog_size=BACKLOG
-        )
-    except RuntimeError as error:
-        raise UsageError(f"--live: port {port} cannot be had ({error}); choose another with --live-port") from error
-    try:
-        on_open(server.port)
-        yield _make_watcher(foxglove, context)
-    finally:
-        # It waits for every viewer to take its leave; one that has stalled never does.
-        stopping = threading.Thread(target=server.stop, name="live view's end", daemon=True)
-        stopping.start()
-        stopping.join(STOP_S)
-
-
-def _make_watcher(foxglove: ModuleType, context: object) -> Watcher:
-    logs: dict[str, Callable[..., None]] = {}  # a channel's entrance, by topic
-
-    def watch(definition: Definition, at_ns: int, data: bytes) -> None:
-        if definition.schema_encoding == "":
-            return
-        if definition.topic not in logs:
-            schema = foxglove.Schema(
-                name=definition.schema_name, encoding=definition.schema_encoding, data=definition.schema
-            )
-            channel = foxglove.Channel(
-                definition.topic, schema=schema, message_encoding=definition.encoding, context=context
-            )
-            logs[definition.topic] = channel.log
-        logs[definition.topic](data, log_time=at_ns)
-
-    return watch
 
 
 POLL_S = 0.02

@@ -151,7 +151,7 @@ def find_extra_modules() -> set[str]:
 
 def test_without_any_extra_every_help_and_every_refusal_works(tmp_path: Path) -> None:
     result = find_extra_modules()
-    assert {"pyarrow", "pandas", "polars", "distributed", "foxglove", "natnet", "qtm_rt", "pyulog"} <= result
+    assert {"pyarrow", "pandas", "polars", "distributed", "natnet", "qtm_rt", "pyulog"} <= result
     lines = [[*command.split(), "--help"] for command in COMMANDS]
     lines += [["-v"], ["--json"], ["--unknown"], ["loopback", "--unknown"], ["--version"], ["--install-completion"]]
     needs = {

@@ -11,7 +11,7 @@ import pytest
 from places import TESTS
 
 PAGE = TESTS.parent / "docs" / "faults.md"
-NUMBERS = (*range(1, 73), *range(86, 97), 99, 100)
+NUMBERS = (*range(1, 73), *range(86, 102))
 
 
 def find_marked_tests(source: str) -> list[tuple[int, str]]:
@@ -73,6 +73,6 @@ def test_marks_are_found_as_pytest_finds_them() -> None:
     text = '@pytest.mark.parametrize("x", [1])\n@pytest.mark.fault(3, 4)\ndef test_a(): ...\n# @pytest.mark.fault(5)\n'
     assert find_marked_tests(text) == [(3, "test_a"), (4, "test_a")]
     assert find_marked_tests("class TestIt:\n    @pytest.mark.fault(7)\n    def test_b(self): ...") == [(7, "test_b")]
-    for wrong in ("@pytest.mark.fault(98)\ndef test_a(): ...", "@pytest.mark.fault(1)\ndef helper(): ..."):
+    for wrong in ("@pytest.mark.fault(80)\ndef test_a(): ...", "@pytest.mark.fault(1)\ndef helper(): ..."):
         with pytest.raises(ValueError, match="marks no row"):
             find_marked_tests(wrong)

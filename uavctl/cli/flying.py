@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +17,7 @@ from msgspec.structs import replace
 from logs.recording.ends import count_missing_records, describe_ending
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
-from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
+from logs.recording.recorder import DerivedTopics, RecorderStatus
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, label_text, print_message
@@ -88,16 +87,11 @@ LIVE_PORT = 8765  # where Foxglove looks first
 Live = Annotated[
     bool,
     Parameter(
-        negative=(),
-        help="show the flight in a browser on this machine and, with uavctl[live], serve its topics to Foxglove",
+        negative=(), help="show the flight to browsers and to Foxglove on this machine, from a process of its own"
     ),
 ]
 LivePort = Annotated[
-    int | None,
-    Parameter(
-        help=f"TCP port for Foxglove, 0 is any free one; else {LIVE_PORT}. The page's is the next one",
-        validator=FREE_PORT,
-    ),
+    int | None, Parameter(help=f"TCP port of the live view, 0 is any free one; else {LIVE_PORT}", validator=FREE_PORT)
 ]
 
 
@@ -114,31 +108,31 @@ def choose_live_port(*, live: bool, port: int | None) -> int | None:
 
 @contextmanager
 def open_viewers(live_port: int | None = None) -> Iterator[DerivedTopics]:
-    """Open the viewers of a flight: views in its recording and, with a port, a live page and a live view.
+    """Open the viewers of a flight: views in its recording and, with a port, a live view in a process of its own.
 
     Args:
-        live_port: TCP port of the view, the page has the next one; 0: any free ports.
+        live_port: TCP port of the live view; 0: any free one; None: no live view.
 
     Raises:
-        UsageError: A port cannot be opened.
+        UsageError: The live view cannot be opened.
     """
     if live_port is None:
         yield DerivedTopics(ViewBuilder())
         return
-    from logs.live import FlightScene, serve_live_page  # loaded only for a live view
+    from logs.live.process import LiveProcess  # loaded only for a live view
 
-    def print_address(port: int) -> None:
-        print_message(f'for Foxglove: ws://localhost:{port} ("Open connection")')
+    live = LiveProcess(live_port, report_dead_view)
+    try:
+        print_message(f"live page: http://localhost:{live.port}/")
+        print_message(f'for Foxglove: ws://localhost:{live.port}/{live.token} ("Open connection")')
+        yield DerivedTopics(ViewBuilder(), live.send)
+    finally:
+        live.close()
 
-    scene, has_sdk = FlightScene(), find_spec("foxglove") is not None
-    with (
-        serve_live_page(scene.scene, live_port and live_port + 1) as address,
-        live_view(live_port if has_sdk else None, on_open=print_address) as view,
-    ):
-        print_message(f"live page: {address}")
-        if not has_sdk:
-            print_message("nothing for Foxglove: that takes pip install 'uavctl[live]'")
-        yield DerivedTopics(ViewBuilder(), view, scene.add_record)
+
+def report_dead_view(reason: str) -> None:
+    """Print that the process of a live view has ended."""
+    print_message(label_text("warning", f"the live view has ended ({reason}); the flight goes on without it"))
 
 
 def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:

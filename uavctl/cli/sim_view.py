@@ -8,20 +8,26 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import msgspec
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 
 from sim.simulation import VehicleSnapshot
 from uavctl.cli.common import Column, WideTable
+from uavctl.cli.flying import report_dead_view
 from uavctl.config import Config
 from uavctl.config.checks import get_position_limits_m
 from uavctl.records import Vec3
 from uavctl.smpc.plant import AXES
 
 if TYPE_CHECKING:
-    from logs.live import Level, LiveScene
+    from logs.live.process import LiveProcess
+    from logs.live.scene import Level, LiveScene
 
 REFRESH_PERIOD_S = 0.25
+
+
+PAGE_PERIOD_S = 0.1
 
 
 LINE_PERIOD_S = 1.0  # between two lines, without a terminal
@@ -101,7 +107,7 @@ def show_view(console: Console, config: Config) -> Iterator[Callable[[tuple[Vehi
 
     The yielded function takes the snapshots. A thread of its own draws, so the caller never waits for a terminal.
     """
-    from logs.live import serve_live_page  # loaded only for a view
+    from logs.live.process import LiveProcess  # loaded only for a view
 
     latest: list[tuple[VehicleSnapshot, ...]] = []
     done = threading.Event()
@@ -112,19 +118,35 @@ def show_view(console: Console, config: Config) -> Iterator[Callable[[tuple[Vehi
     draw = _draw_table if console.is_terminal else _write_lines
     if not console.is_terminal:
         console.print("--view: no terminal to draw in, so a line a second", soft_wrap=True)
-    with serve_live_page(lambda: make_scene(latest[0], config) if latest else None, 0) as address:
-        thread = threading.Thread(target=draw, args=(console, address, latest, done), name="view", daemon=True)
+    live = LiveProcess(0, report_dead_view)
+    address = f"http://localhost:{live.port}/"
+    threads = (
+        threading.Thread(target=draw, args=(console, address, latest, done), name="view", daemon=True),
+        threading.Thread(target=_feed_page, args=(live, config, latest, done), name="live page", daemon=True),
+    )
+    for thread in threads:
         thread.start()
-        try:
-            yield update
-        finally:
-            done.set()
+    try:
+        yield update
+    finally:
+        done.set()
+        for thread in threads:
             thread.join(END_LIMIT_S)
+        live.close()
+
+
+def _feed_page(live: LiveProcess, config: Config, latest: LatestSnapshots, done: threading.Event) -> None:
+    """Send the newest state to the live page, ten times a second."""
+    from logs.live.feed import SCENE
+
+    while not done.wait(PAGE_PERIOD_S):
+        for snapshots in latest:
+            live.send(SCENE, 0, msgspec.json.encode(make_scene(snapshots, config)))
 
 
 def make_scene(snapshots: Snapshots, config: Config) -> LiveScene:
     """Return the scene of a live page: simulated vehicles and the limits of their room."""
-    from logs.live import LiveScene, SceneBody, SceneBox, SceneEvent, SceneFigure
+    from logs.live.scene import LiveScene, SceneBody, SceneBox, SceneEvent, SceneFigure
 
     limits = get_position_limits_m(config)
     walls = [[side if math.isfinite(side) else None for side in limits.get(axis, (math.inf,) * 2)] for axis in AXES]

@@ -295,7 +295,7 @@ def test_29_what_waited_in_a_rest_is_written_at_the_end(tmp_path: Path) -> None:
 def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
     seen: list[tuple[str, bytes]] = []
     room, clock = Room(), Clock()
-    looking = DerivedTopics(ViewBuilder(), lambda definition, _, data: seen.append((definition.topic, data)))
+    looking = DerivedTopics(ViewBuilder(), lambda topic, _, data: seen.append((topic, data)))
     log = LogConfig(low_bytes=LOW, stop_bytes=STOP)
     recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, derived_topics=looking)
     loaded = load_config("room-hahn-stursberg")

@@ -1,20 +1,10 @@
-"""Live page: what goes on now, for any browser on this machine.
-
-A `LiveScene` holds what is to be seen at a moment. A server of the standard library sends it ten times a second to
-each page that is open, as events of one long answer; without a page nothing is made. Whoever flies, or simulates, only
-leaves its newest state behind, and never waits.
-"""
+"""What the live page shows at a moment, and how a flight's records make it."""
 
 from __future__ import annotations
 
 import math
-import threading
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Literal, TypeVar
 
 import msgspec
@@ -22,7 +12,7 @@ import msgspec
 from logs.recording.derived_topics import tighten_limits
 from logs.recording.design_view import AXIS_NUMBER, DesignView, get_config_name, read_design
 from uavctl.arrays import Array
-from uavctl.errors import RecordingError, UsageError
+from uavctl.errors import RecordingError
 from uavctl.records import (
     ControlMode,
     Decision,
@@ -40,14 +30,7 @@ from uavctl.records import (
     VehicleStatus,
 )
 
-HOST = "127.0.0.1"
-NAMES = frozenset({HOST, "localhost"})  # by which a page may ask: another one's would be a foreign site's
-PERIOD_S = 0.1  # between two states
-MOST_PAGES = 4  # open at once
-PATIENCE_S = 5.0  # a page that takes nothing for so long is let go
 MOST_EVENTS = 12
-PAGE = Path(__file__).with_name("live.html")
-SCRIPT = Path(__file__).with_name("live.js")
 R = TypeVar("R", bound=Record)
 Level = Literal["good", "warn", "bad", "plain"]
 _LEVELS: dict[Severity, Level] = {Severity.INFO: "plain", Severity.WARNING: "warn", Severity.ERROR: "bad"}
@@ -104,7 +87,7 @@ class LiveScene(msgspec.Struct, frozen=True):
 
 
 class FlightScene:
-    """Keeps the newest record of each kind; whoever puts records never waits for whoever looks."""
+    """Keeps the newest record of each kind."""
 
     def __init__(self) -> None:
         self._newest: dict[type[Record], Record] = {}
@@ -158,7 +141,7 @@ class FlightScene:
             figures=tuple(self._list_figures(decision, current)),
             events=tuple(
                 SceneEvent((event.at_ns - header.started_ns) * 1e-9, _LEVELS[event.severity], event.text)
-                for event in reversed(self._events.copy())
+                for event in reversed(self._events)
             ),
         )
 
@@ -220,104 +203,3 @@ def _make_box(design: DesignView, lower: Array, upper: Array) -> SceneBox:
                 bounds[AXIS_NUMBER[axis]] = float(limits[index])
         sides.append(tuple(bounds))
     return SceneBox(*sides)
-
-
-Look = Callable[[], LiveScene | None]
-
-
-@contextmanager
-def serve_live_page(get_scene: Look, port: int) -> Iterator[str]:
-    """Serve the page on this machine alone; yields its address.
-
-    Args:
-        look: gives what is to be seen now, from any thread; None while there is nothing yet.
-        port: TCP port, 0 for a free one.
-
-    Raises:
-        UsageError: the port cannot be had.
-    """
-    if not 0 <= port <= 65535:
-        raise UsageError(f"live page: port {port}; ports are 1 to 65535, and 0 takes one that is free")
-    try:
-        server = _Server(get_scene, port)
-    except OSError as error:
-        raise UsageError(
-            f"live page: port {port} cannot be had ({error.strerror}); choose another, or 0 for one that is free"
-        ) from error
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, name="live page", daemon=True)
-    thread.start()
-    try:
-        yield f"http://localhost:{server.server_port}/"
-    finally:
-        server.ended.set()
-        server.shutdown()
-        server.server_close()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False  # a page that has stalled takes its leave by itself
-
-    def __init__(self, look: Look, port: int) -> None:
-        self.look, self.ended = look, threading.Event()
-        self.seats = threading.BoundedSemaphore(MOST_PAGES)
-        super().__init__((HOST, port), _Handler)
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing: a browser that goes away is no error."""
-
-
-class _Handler(BaseHTTPRequestHandler):
-    server: _Server
-    timeout = PATIENCE_S
-    protocol_version = "HTTP/1.1"
-    server_version, sys_version = "uavctl", ""
-
-    def do_GET(self) -> None:
-        """Answer a page, its script, or its stream of states."""
-        if self.headers.get("Host", "").rsplit(":", 1)[0] not in NAMES:
-            self.send_error(HTTPStatus.FORBIDDEN, "only this machine, by the name of localhost")
-        elif self.path == "/":
-            self._file(PAGE, "text/html; charset=utf-8")
-        elif self.path == "/live.js":
-            self._file(SCRIPT, "text/javascript; charset=utf-8")
-        elif self.path == "/scenes":
-            self._scenes()
-        else:
-            self.send_error(HTTPStatus.NOT_FOUND)
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: standard error is the flight's."""
-
-    def _file(self, path: Path, kind: str) -> None:
-        data = path.read_bytes()
-        self._begin(kind, length=len(data))
-        self.wfile.write(data)
-
-    def _scenes(self) -> None:
-        if not self.server.seats.acquire(blocking=False):
-            self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_PAGES} pages are open")
-            return
-        try:
-            self._begin("text/event-stream")
-            self.close_connection = True
-            while not self.server.ended.is_set():
-                scene = self.server.look()
-                self.wfile.write(b"data: " + msgspec.json.encode(scene) + b"\n\n")
-                self.server.ended.wait(PERIOD_S)
-        except OSError:  # it has gone, or takes nothing any more
-            self.close_connection = True
-        finally:
-            self.server.seats.release()
-
-    def _begin(self, kind: str, length: int | None = None) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", kind)
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("Content-Security-Policy", "default-src 'self'; style-src 'unsafe-inline'")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        if length is None:
-            self.send_header("Connection", "close")
-        else:
-            self.send_header("Content-Length", str(length))
-        self.end_headers()

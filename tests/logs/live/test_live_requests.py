@@ -1,0 +1,168 @@
+"""Requests to the live view: which are answered, and that whatever comes is read or refused."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from http import HTTPStatus
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from live_rig import HANDSHAKE, make_head
+
+from logs.live.request import RefusedError, check_request, parse_request
+from logs.live.websocket import LARGEST, Opcode, WebSocketError, make_handshake, read_frame
+
+TOKEN = "t0ken"
+FOREIGN = "https://flights.example"
+
+
+def check(**changes: str) -> HTTPStatus:
+    """The status of a request: a browser's for the page, with other headers, path or method."""
+    path, method = changes.pop("path", "/"), changes.pop("method", "GET")
+    headers = {"Host": "localhost:8765", **changes}
+    try:
+        check_request(parse_request(make_head(headers, path, method)), TOKEN)
+    except RefusedError as refused:
+        return refused.status
+    return HTTPStatus.OK
+
+
+@pytest.mark.fault(98)
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost:8765", 200),
+        ("localhost", 200),
+        ("LocalHost:80", 200),
+        ("127.0.0.1:9000", 200),
+        ("", 403),
+        ("flights.example:8765", 403),
+        ("localhost.flights.example", 403),
+        ("127.0.0.1.flights.example", 403),
+        ("localhost:8765@flights.example", 403),
+        ("localhost:8765, flights.example", 403),
+        ("localhost:", 403),
+        ("127.0.0.2", 403),
+        ("127x0.0.1", 403),
+        ("[::1]:8765", 403),
+    ],
+)
+def test_98_only_this_machine_s_names_are_a_host(host: str, status: int) -> None:
+    assert check(Host=host) == status
+    assert check(**{**HANDSHAKE, "Host": host}) == status
+
+
+@pytest.mark.fault(98)
+def test_98_a_host_that_comes_twice_is_none() -> None:
+    head = b"GET / HTTP/1.1\r\nHost: localhost\r\nhost: localhost\r\n\r\n"
+    with pytest.raises(RefusedError) as refused:
+        check_request(parse_request(head), TOKEN)
+    assert refused.value.status == 403
+
+
+@pytest.mark.fault(98)
+@pytest.mark.parametrize(
+    ("origin", "path", "status"),
+    [
+        ("http://localhost:8765", "/", 200),
+        ("http://localhost:8080", "/", 403),
+        ("https://localhost:8765", "/", 403),
+        ("http://127.0.0.1:8765", "/", 403),
+        (FOREIGN, "/", 403),
+        ("null", "/", 403),
+        ("", "/", 403),
+        (FOREIGN, f"/{TOKEN}", 200),
+        ("null", f"/{TOKEN}", 200),
+        (FOREIGN, f"/{TOKEN}x", 403),
+        (FOREIGN, f"/?{TOKEN}", 403),
+        ("http://localhost:8765", "/wrong", 404),
+    ],
+)
+def test_98_another_site_opens_the_websocket_with_the_token_alone(origin: str, path: str, status: int) -> None:
+    assert check(**{**HANDSHAKE, "Host": "localhost:8765"}, Origin=origin, path=path) == status
+
+
+@pytest.mark.fault(98)
+def test_98_another_site_reads_no_page_even_with_the_token() -> None:
+    for path in ("/", "/live.js", "/scenes"):
+        assert (check(path=path), check(path=path, Origin=FOREIGN)) == (200, 403)
+    assert check(path=f"/{TOKEN}") == 404
+    assert check(path=f"/{TOKEN}", Origin=FOREIGN) == 403
+
+
+@pytest.mark.fault(98)
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "CONNECT", "TRACE", "HEAD", "get", ""])
+def test_98_nothing_but_get_is_allowed(method: str) -> None:
+    assert check(method=method) == 405
+    assert check(**HANDSHAKE, method=method, path=f"/{TOKEN}") == 405
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_request_or_refused(data: bytes) -> None:
+    for head in (data, b"GET / HTTP/1.1\r\n" + data, make_head({"Host": "localhost"})[:-2] + data):
+        try:
+            request = parse_request(head + b"\r\n\r\n")
+            check_request(request, TOKEN)
+            make_handshake(request, ("foxglove.sdk.v1",))
+        except RefusedError as refused:
+            assert 400 <= refused.status < 500
+
+
+@pytest.mark.parametrize("name", ["Sec-WebSocket-Key", "Sec-WebSocket-Version", "Sec-WebSocket-Protocol"])
+def test_a_handshake_that_lacks_a_header_is_refused(name: str) -> None:
+    headers = {key: value for key, value in HANDSHAKE.items() if key != name}
+    assert make_handshake(parse_request(make_head(HANDSHAKE)), ("foxglove.sdk.v1",))
+    with pytest.raises(RefusedError):
+        make_handshake(parse_request(make_head(headers)), ("foxglove.sdk.v1",))
+
+
+def test_a_handshake_is_answered_as_in_rfc_6455() -> None:
+    """Section 1.3 has the key and its answer."""
+    headers = {**HANDSHAKE, "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": "x, b, a"}
+    answer = make_handshake(parse_request(make_head(headers)), ("a", "b"))
+    assert b"Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=\r\n" in answer
+    assert b"Sec-WebSocket-Protocol: a\r\n" in answer
+
+
+def read(data: bytes) -> tuple[Opcode, bytes]:
+    async def run() -> tuple[Opcode, bytes]:
+        reader = asyncio.StreamReader()
+        reader.feed_data(data)
+        reader.feed_eof()
+        return await read_frame(reader, 10.0)
+
+    return asyncio.run(run())
+
+
+def test_frames_are_read_as_in_rfc_6455() -> None:
+    """Section 5.7 has the first one."""
+    assert read(bytes.fromhex("818537fa213d7f9f4d5158")) == (Opcode.TEXT, b"Hello")
+    assert read(b"\x88\x80abcd") == (Opcode.CLOSE, b"")
+    assert read(b"\x82\xfe\x00\x7e" + bytes(4) + b"x" * 126) == (Opcode.BINARY, b"x" * 126)
+
+
+@pytest.mark.fault(98)
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x81\x05Hello",  # not masked
+        b"\x01\x85" + bytes(9),  # the first of several parts
+        b"\x80\x85" + bytes(9),  # a later part
+        b"\xc1\x85" + bytes(9),  # a reserved bit
+        b"\x83\x85" + bytes(9),  # a kind that does not exist
+        b"\x89\xfe\x00\x7e" + bytes(130),  # a ping that is too long
+        b"\x81\xff" + (LARGEST + 1).to_bytes(8, "big") + bytes(8),
+        b"\x81\xff" + b"\xff" * 8 + bytes(8),
+    ],
+)
+def test_98_a_frame_that_breaks_the_protocol_is_refused_before_it_is_read(data: bytes) -> None:
+    with pytest.raises(WebSocketError):
+        read(data)
+
+
+@given(st.binary(max_size=64))
+def test_any_bytes_are_a_frame_or_refused(data: bytes) -> None:
+    with suppress(WebSocketError, asyncio.IncompleteReadError):
+        assert len(read(data)[1]) < len(data)
