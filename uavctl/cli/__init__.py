@@ -33,7 +33,9 @@ def main() -> None:
         code = run(_arguments, _freeze_imports)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
-        code = INTERRUPTED
+        finish_streams()
+        # At its end the interpreter would kill itself by the signal, if that came while a dataclass was made.
+        os._exit(INTERRUPTED)
     except Exception:  # noqa: BLE001 an error that nobody expected
         sys.stderr.write(format_exc())
         code = 1
