@@ -152,7 +152,7 @@ CAUSES: dict[Cause, CauseText] = {
     _C.POSITIONS_ABSENT: CauseText(_R.POSITIONS, BAD, "No positions", "no positions came"),
     _C.POSITIONS_APART: CauseText(_R.POSITIONS, CAUTION, "Positions disagree"),
     _C.STAMPS_UNUSABLE: CauseText(_R.POSITIONS, BAD, "Time stamps unusable"),
-    _C.RELAY_ATTITUDE: CauseText(_R.POSITIONS, BAD, "Poses turned", "the attitude of poses was wrong"),
+    _C.RELAY_ATTITUDE: CauseText(_R.POSITIONS, BAD, "Poses turned"),
     _C.RELAY_SILENT: CauseText(_R.POSITIONS, BAD, "Relay silent"),
     _C.SILENCE: CauseText(_R.POSITIONS, CAUTION, "No positions for a while"),
     _C.ENVELOPE: CauseText(_R.ENDING, BAD, "Let go", "let go by the envelope"),
