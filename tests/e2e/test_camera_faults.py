@@ -25,6 +25,7 @@ PAIRS = [("room", "px4"), ("room", "ardupilot"), ("room-px4", "px4"), ("room-ard
         ("heavy-3cm", 1),
         ("white-5cm", 22),
         ("average", 12),
+        ("first-order", 302),
     ],
 )
 def test_a_camera_fault_is_flown_through(kind: str, seed: int, preset: str, autopilot: str) -> None:

@@ -30,6 +30,7 @@ from msgspec import structs
 from uavctl.arrays import SECOND_NS
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
+from uavctl.flight.monitors import velocity
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.velocity import VelocityState
@@ -150,7 +151,7 @@ def test_a_contradiction_counts_from_a_window_after_the_first_second_of_position
 @pytest.mark.parametrize("known", [("offsets",), ("places",), ("offsets", "places")])
 def test_a_distance_that_begins_anew_is_not_compared_with_what_was_before(known: tuple[str, ...]) -> None:
     """Nor is one that is not known: this tick brings no position."""
-    values = {"offsets": offsets(0.0)["offsets"], "places": ((START_NS - SECOND_NS, ZERO),)}
+    values = {"offsets": offsets(0.0)["offsets"], "places": ((START_NS - SECOND_NS, ZERO, ZERO),)}
     before = monitors(tick_ns=START_NS, **{name: values[name] for name in known})
     flown = ((START_NS, ZERO),)
     for path, own, is_kept in (((), AT_REST, False), (flown, None, False), (flown, AT_REST, True)):
@@ -166,8 +167,8 @@ def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorStat
     """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
     known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
     middle_ns = AT_NS - 256 * MS
-    older = tuple((middle_ns - age_ns - n * SECOND_NS, ZERO) for n in range(before, 0, -1))
-    places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
+    older = tuple((middle_ns - age_ns - n * SECOND_NS, ZERO, ZERO) for n in range(before, 0, -1))
+    places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0]), ZERO))
     return look(ZERO, vehicle_motion=AT_REST, places=places, **known)
 
 
@@ -195,6 +196,26 @@ def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
         assert (breach is not None) == breached
 
 
+@pytest.mark.parametrize(
+    ("late_s", "across_m", "breached"),
+    [
+        (0.29, 0.0, False),  # positions that are smoothed follow late
+        (0.3, 1.0, True),
+        (-0.29, 0.0, True),  # none come early
+        (0.5, 0.0, True),  # so late is no smoothing
+    ],
+)
+@pytest.mark.fault(100)
+def test_smoothing_explains_a_change_of_offsets_with_the_velocity(
+    late_s: float, across_m: float, breached: bool
+) -> None:
+    """At rest now; the vehicle flew at 5 m/s to the north 10 s before, by its own word."""
+    known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
+    places = ((AT_NS - 10 * SECOND_NS, (-late_s * 5.0, across_m, 0.0), (5.0, 0.0, 0.0)),)
+    _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **known)
+    assert (breach is not None) == breached
+
+
 def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
     _, breach = creeping(9.0, SECOND_NS, before=3)
     assert breach is not None and breach.cause == EventCode.VELOCITY
@@ -209,7 +230,7 @@ def test_a_place_of_the_way_is_remembered_each_second_for_half_a_minute(age_ns: 
     assert breach is None
     assert len(watching.velocity.places) == kept
     if kept == 2 or age_ns >= 30 * SECOND_NS:
-        at_ns, place = watching.velocity.places[-1]
+        at_ns, place, _ = watching.velocity.places[-1]
         assert at_ns == AT_NS - 256 * MS and isinstance(at_ns, int)
         np.testing.assert_allclose(place, ZERO, atol=1e-12)
 
@@ -221,13 +242,14 @@ def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
 
 def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
     watching, _ = look(ZERO, vehicle_motion=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
-    ((at_ns, place),) = watching.velocity.places
+    ((at_ns, place, velocity),) = watching.velocity.places
     assert at_ns == AT_NS - 200 * MS
     np.testing.assert_allclose(place, (-0.125 * 0.2, 0.0, 0.0), atol=1e-12)
+    assert velocity == ZERO
 
 
 def test_over_a_gap_the_way_is_not_compared() -> None:
-    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
+    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0), ZERO),)
     for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
         watching, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
         assert breach is None
@@ -251,7 +273,7 @@ def test_a_contradiction_is_reported_before_scatter_and_after_an_unexplained_acc
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
-    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
+    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0), ZERO),)
     _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(9.0))
     assert breach is not None and breach.text.startswith("positions move otherwise")
 
@@ -418,3 +440,13 @@ def test_the_first_second_of_positions_after_a_silence_corrects_the_vehicle_s_ow
     if found:
         late_ms = 2200 if silence_ms > 1000 else 0  # the window of comparison, 1.2 s, begins after that second
         assert late_ms <= found_ms[0] <= late_ms + 1000
+
+
+@pytest.mark.fault(100)
+@pytest.mark.parametrize("std_m", [0.012, 0.0121, 0.05])
+def test_noise_bounds_the_slope_that_chance_makes(std_m: float) -> None:
+    """Four standard deviations of a slope by least squares over 0, 0.25 and 0.5 s."""
+    three = tuple((START_NS + ms * MS, ZERO) for ms in (0, 250, 500))
+    usual_m = 0.012
+    slope_mps = 4.0 * std_m / math.sqrt(2.0 * 0.25**2) if std_m > usual_m else 0.0
+    assert velocity._bound_noise_mps(three, std_m) == pytest.approx(slope_mps)

@@ -4,7 +4,7 @@
 2. The slope of the offsets over a second or so is the difference of both velocities. Stamps that are late explain a
    part that is the acceleration times the delay. What is left is compared with its bound. Then: end the plans.
 3. The mean offsets of half a minute show a frame that creeps: their change is compared with a bound that grows with
-   time. Then: end the plans.
+   time. Smoothing in a camera system explains a part: a delay times the change of the velocity. Then: end the plans.
 4. Velocities contradicted each other, and then no position came for 0.6 s. Then: end the plans.
 5. While positions that have come back correct the vehicle's own velocity, no difference counts.
 
@@ -36,6 +36,7 @@ PLAIN = 1.5  # this many times the bound is beyond it at once
 CORRECTS_NS = 1_000_000_000
 UNRESOLVED_NS = 600_000_000  # longest time without positions after a contradiction
 LATE_S = 0.15  # largest difference between the delays of positions and of the vehicle's own velocity
+SMOOTHED_S = 0.3  # the same with smoothing inside a camera system, which makes positions follow late
 SHORTEST = 0.3  # of the window: over less, two velocities are not compared
 PLACES_NS, PLACE_NS = 30_000_000_000, 1_000_000_000  # mean offsets are compared over so long, one for each such time
 # Of the disagreement: the bound of a change of offset begins with so many seconds of it, and grows by such a part.
@@ -48,7 +49,7 @@ Offsets = tuple[
     tuple[int, Vector], ...
 ]  # (capture time [ns], position minus the vehicle's own distance (3,)), in order
 
-Places = tuple[tuple[int, Vector], ...]  # the same, means over the window
+Places = tuple[tuple[int, Vector, Vector], ...]  # (at_ns, mean offset (3,), own velocity (3,)) over the window
 
 
 class VelocityState(msgspec.Struct, frozen=True, eq=False):
@@ -81,7 +82,7 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
         return replace(state, offsets=offsets, places=places, apart_mps=None, apart_ns=None), NO_VERDICT
     resumed_ns = observation.motion.resumed_ns
     corrects = resumed_ns is not None and at_ns - parameters.window_ns < resumed_ns + CORRECTS_NS
-    drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, points, parameters)
+    drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, points, path, parameters)
     apart = _remove_delay(slope, path, offsets)
     apart_mps = math.hypot(*apart)
     bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, observation.std_m)
@@ -123,7 +124,11 @@ def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:
 
 
 def _find_drift(
-    places: Places, offsets: Offsets, points: Array, parameters: EnvelopeParameters
+    places: Places,
+    offsets: Offsets,
+    points: Array,
+    path: tuple[tuple[int, Vector], ...],
+    parameters: EnvelopeParameters,
 ) -> tuple[tuple[float, list[float]] | None, Places]:
     """Find the time [s] in which offsets changed too much, and the change (3,) [m]; return too the places after it."""
     at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
@@ -131,14 +136,36 @@ def _find_drift(
     mean: Array = np.add.reduce(points, axis=0) / len(offsets)
     place: list[float] = mean.tolist()
     places = places[bisect_right(places, at_ns - PLACES_NS, key=_TIME) :]
-    for since_ns, before in places:
+    velocity = _find_mean_velocity(path, offsets)
+    for since_ns, before, velocity_before in places:
         s, off = (at_ns - since_ns) * 1e-9, [now - then for now, then in zip(place, before, strict=True)]
+        off = _remove_smoothing(off, [now - then for now, then in zip(velocity, velocity_before, strict=True)])
         # |ō - ō_0| > (2 s + 0.16 s) v_max
         if math.hypot(*off) > (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps:
             return (s, off), places
     if not places or at_ns - places[-1][0] >= PLACE_NS:
-        places = (*places, (at_ns, tuple(place)))
+        places = (*places, (at_ns, tuple(place), velocity))
     return None, places
+
+
+def _find_mean_velocity(path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> Vector:
+    """Find the vehicle's own mean velocity (3,) [m/s] over the window; zero where it is not known."""
+    (begin_ns, _), (end_ns, _) = offsets[0], offsets[-1]
+    begin, end = find_distance(path, begin_ns), find_distance(path, end_ns)
+    if begin is None or end is None:
+        return 0.0, 0.0, 0.0
+    # v̄ = (s_1 - s_0) / T
+    return tuple((s_1 - s_0) / ((end_ns - begin_ns) * 1e-9) for s_0, s_1 in zip(begin, end, strict=True))
+
+
+def _remove_smoothing(off: list[float], change_mps: list[float]) -> list[float]:
+    """Return a change of offsets (3,) [m] without the part that smoothing makes of a change of the velocity (3,)."""
+    along = sum(v * v for v in change_mps)
+    if along == 0.0:
+        return off
+    # τ = -Δo' Δv / Δv' Δv, within [0, τ_max]; Δo + τ Δv
+    late_s = min(max(-sum(o * v for o, v in zip(off, change_mps, strict=True)) / along, 0.0), SMOOTHED_S)
+    return [o + late_s * v for o, v in zip(off, change_mps, strict=True)]
 
 
 def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) -> Array | None:
