@@ -32,6 +32,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "uavctl/flight/monitors/observer.py": ENVELOPE,
     "uavctl/flight/monitors/outside.py": ENVELOPE,
     "uavctl/flight/monitors/vehicle_velocity.py": ENVELOPE,
+    "uavctl/flight/monitors/response.py": ("tests/flight/test_response.py",),
     "uavctl/flight/monitors/velocity.py": ENVELOPE,
     "uavctl/flight/monitors/velocity_change.py": ("tests/flight/test_velocity_change.py",),
     "uavctl/flight/monitors/verdict.py": (

@@ -150,3 +150,16 @@ def test_the_same_own_velocity_is_one_sample() -> None:
     once = update(INITIAL, tick, NO_POSITIONS)
     assert [captured_ns for captured_ns, *_ in once.samples] == [START_NS]
     assert update(once, tick, NO_POSITIONS) == once
+
+
+@pytest.mark.parametrize(
+    ("state", "contradicts"),
+    [
+        (VelocityChangeState(agreed_ns=START_NS), False),
+        (VelocityChangeState(disagrees_ns=START_NS), True),
+        (VelocityChangeState(velocity_wrong_ns=0), True),
+        (VelocityChangeState(inertial_wrong_ns=0), True),
+    ],
+)
+def test_what_differs_or_was_found_wrong_contradicts(state: VelocityChangeState, contradicts: bool) -> None:
+    assert state.contradicts == contradicts

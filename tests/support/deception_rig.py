@@ -1,11 +1,11 @@
-"""Flights between walls whose data deceive in a silence of the cameras, judged on the true vehicle."""
+"""Flights between walls whose data deceive, or whose response is wrong, judged on the true vehicle."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from soak_pairs import compute_outside_m
 
 from sim.autopilot.inertial import InertialMeasurement
+from sim.autopilot.setpoints import ParsedSetpoint, SetpointKind
 from sim.cameras import Cameras
 from sim.simulation import World
 from uavctl.config import Config, load_config
@@ -24,6 +25,7 @@ from uavctl.records import Event, Record, Vec3
 
 SOURCES = ("velocity", "attitude", "inertial", "positions")
 KINDS = ("frozen", "scaled", "flipped", "swapped", "delayed")
+RESPONSES = ("turned 90", "turned 180", "turned 270", "mirrored north", "mirrored east", "dead", "delayed")
 DELAY_S = 0.3
 SCALE = 0.3
 BLACKOUT_S = 4.0
@@ -36,8 +38,8 @@ class Deception:
     """A source that deceives from a time on.
 
     Attributes:
-        source: One of `SOURCES`.
-        kind: One of `KINDS`.
+        source: One of `SOURCES`, or "response": how the vehicle answers acceleration setpoints.
+        kind: One of `KINDS`; of a response, one of `RESPONSES`.
         at_s: When it begins, since the start [s].
     """
 
@@ -128,6 +130,9 @@ def deceive(world: World, deceptions: Sequence[Deception], get_time_s: Callable[
             sensors.estimate_attitude = estimate  # type: ignore[method-assign]
         elif deception.source == "inertial":
             sensors.measure = _wrap_inertial(sensors.measure, deception)  # type: ignore[method-assign, assignment]
+        elif deception.source == "response":
+            answer = _wrap_response(autopilot.pilot.receive_setpoint, deception)
+            autopilot.pilot.receive_setpoint = answer  # type: ignore[method-assign, assignment]
         else:
             _deceive_cameras(world.peers.cameras, deception)
 
@@ -174,6 +179,35 @@ def _wrap_inertial(
         return true._replace(force_mps2=(north, east, down))
 
     return measure_distorted
+
+
+def _wrap_response(
+    receive: Callable[[ParsedSetpoint, int], None], deception: Deception
+) -> Callable[[ParsedSetpoint, int], None]:
+    delayed = ValueDistorter("delayed")
+
+    def receive_distorted(setpoint: ParsedSetpoint, at_ns: int) -> None:
+        deceives = at_ns * 1e-9 >= deception.at_s
+        late = delayed.distort(at_ns * 1e-9, setpoint.vector, deceives=True)
+        if deceives and setpoint.kind is SetpointKind.ACCELERATION:
+            north, east, down = late if deception.kind == "delayed" else turn_response(deception.kind, setpoint.vector)
+            setpoint = replace(setpoint, vector=(north, east, down))
+        receive(setpoint, at_ns)
+
+    return receive_distorted
+
+
+def turn_response(kind: str, accel_mps2: Vec3) -> Vec3:
+    """Return the acceleration [m/s²] that a wrong response makes of a setpoint."""
+    north, east, down = accel_mps2
+    return {
+        "turned 90": (-east, north, down),
+        "turned 180": (-north, -east, down),
+        "turned 270": (east, -north, down),
+        "mirrored north": (-north, east, down),
+        "mirrored east": (north, -east, down),
+        "dead": (0.0, 0.0, 0.0),
+    }[kind]
 
 
 def _deceive_cameras(cameras: Cameras, deception: Deception) -> None:
@@ -239,12 +273,8 @@ def fly_deceived(
     return flight
 
 
-def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float]:
-    """Draw a flight: preset, autopilot, gusts, path between walls, a blackout, and one or two deceptions."""
-    rng = np.random.default_rng([seed, 39])
-    autopilot = ("px4", "ardupilot")[seed % 2]
-    preset = (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
-    believed, controller = prepare_believed(preset, autopilot)
+def _draw_waypoints(rng: np.random.Generator, preset: str, autopilot: str) -> str:
+    believed, _ = prepare_believed(preset, autopilot)
     lower = [believed.sets.state_lower[i * (len(believed.sets.state_lower) // 3)] for i in range(3)]
     upper = [believed.sets.state_upper[i * (len(believed.sets.state_upper) // 3)] for i in range(3)]
     height = -float(rng.uniform(0.8, 1.6))
@@ -252,7 +282,15 @@ def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception],
     if rng.random() < 0.5:
         sides = [(0.9 * lower[0], 0.9 * upper[1]), (0.9 * upper[0], 0.9 * lower[1])]
     corners = [*sides, *sides, *sides]
-    waypoints = ", ".join(f"[{n:.2f}, {e:.2f}, {height:.2f}]" for n, e in corners)
+    return ", ".join(f"[{n:.2f}, {e:.2f}, {height:.2f}]" for n, e in corners)
+
+
+def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float]:
+    """Draw a flight: preset, autopilot, gusts, path between walls, a blackout, and one or two deceptions."""
+    rng = np.random.default_rng([seed, 39])
+    autopilot = ("px4", "ardupilot")[seed % 2]
+    preset = (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
+    waypoints = _draw_waypoints(rng, preset, autopilot)
     blackout_s = float(rng.uniform(3.0, 10.0))
     size = 1 + int(rng.random() < 0.5)
     sources = rng.choice(len(SOURCES), size, replace=False)
@@ -278,3 +316,25 @@ def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception],
     )
     believed, controller = prepare_believed(preset, autopilot, (f"mission.waypoints=[{waypoints}]",))
     return config, believed, controller, deceptions, blackout_s
+
+
+def draw_response_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float | None]:
+    """Draw a flight between walls whose response is wrong from a moment on: no blackout."""
+    rng = np.random.default_rng([seed, 40])
+    autopilot = ("px4", "ardupilot")[seed % 2]
+    preset = (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
+    waypoints = _draw_waypoints(rng, preset, autopilot)
+    at_s = float(rng.uniform(2.5, 14.0))
+    config = load_config(
+        preset,
+        [
+            f"sim.autopilot={autopilot}",
+            f"sim.seed={seed}",
+            "sim.plant=quadrotor",
+            f"mission.waypoints=[{waypoints}]",
+            f"sim.wind.gust_wind_mps={rng.uniform(0.0, 3.0):.2f}",
+            f"duration_s={at_s + AFTER_S}",
+        ],
+    )
+    believed, controller = prepare_believed(preset, autopilot, (f"mission.waypoints=[{waypoints}]",))
+    return config, believed, controller, [Deception("response", str(rng.choice(RESPONSES)), at_s)], None

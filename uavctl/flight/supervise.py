@@ -62,7 +62,7 @@ from uavctl.records import ControlMode, Estimate, Order
 
 # Causes after which no position is believed any more.
 POSITION_CODES = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
-ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING})
+ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING, EventCode.SETPOINT_RESPONSE})
 
 # Without positions and inertial data for so long, a plan is not flown on. A gust makes inertial data implausible for a
 # shorter time, and a burst of losses is shorter.

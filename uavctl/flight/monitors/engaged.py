@@ -13,13 +13,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
-from uavctl.flight.monitors import acceleration, braking, outside, velocity, velocity_change
+from uavctl.flight.monitors import acceleration, braking, outside, response, velocity, velocity_change
 from uavctl.flight.monitors.acceleration import AccelerationState
 from uavctl.flight.monitors.braking import BrakingState
 from uavctl.flight.monitors.motion import Motion, TickObservation, take_position, update_motion
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, select_axes
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.outside import OutsideState
+from uavctl.flight.monitors.response import ResponseState
 from uavctl.flight.monitors.velocity import VelocityState
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict
@@ -38,6 +39,7 @@ class MonitorState(msgspec.Struct, frozen=True, eq=False):
     outside: OutsideState = OutsideState()
     braking: BrakingState = BrakingState()
     velocity_change: VelocityChangeState = VelocityChangeState()
+    response: ResponseState = ResponseState()
     consistent_ns: int | None = None  # capture time of the last position at which all was quiet [ns]; None before any
     agreed: bool = False  # whether positions agreed with the vehicle's inertial data before the flight
 
@@ -71,10 +73,16 @@ def update(
     change_state = velocity_change.update(state.velocity_change, tick, velocity_state)
     believes_velocity = change_state.velocity_wrong_ns is None
     braking_state, no_effect = braking.update(state.braking, tick, believes_velocity=believes_velocity)
+    response_state, wrong_response = response.update(state.response, tick, change_state)
     state = replace(
-        state, velocity=velocity_state, outside=outside_state, braking=braking_state, velocity_change=change_state
+        state,
+        velocity=velocity_state,
+        outside=outside_state,
+        braking=braking_state,
+        velocity_change=change_state,
+        response=response_state,
     )
-    return state, _select_first(first, unresolved, is_out, no_effect)
+    return state, _select_first(first, wrong_response, unresolved, is_out, no_effect)
 
 
 def _update_with_position(

@@ -47,6 +47,12 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     velocity_wrong_ns: int | None = None  # when the own velocity was found wrong [ns]; None while it is not
     inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
 
+    @property
+    def contradicts(self) -> bool:
+        """Whether both changes contradict each other, or one of them was found wrong."""
+        found = (self.disagrees_ns, self.velocity_wrong_ns, self.inertial_wrong_ns)
+        return any(since_ns is not None for since_ns in found)
+
     def supports_velocity(self, at_ns: int) -> bool:
         """Whether inertial data have changed as the own velocity has, just now."""
         return self.velocity_wrong_ns is None and self.agreed_ns is not None and at_ns - self.agreed_ns <= RECENT_NS
