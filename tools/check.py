@@ -87,7 +87,10 @@ def check_wheel() -> str:
         page = run([sys.executable, "-P", "-m", "uavctl", "docs", "faults"], cwd=folder, extra=outside)
         if page != (ROOT / "docs" / "faults.md").read_text(encoding="utf-8"):
             raise StageError("`uavctl docs faults` of the wheel does not show that page")
-        return run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
+        output = run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
+        if not any((folder / "flights").glob("*.html")):
+            raise StageError(f"{output}\nthe wheel made no page of its flight")
+        return output
 
 
 def check_core() -> str:
