@@ -29,7 +29,7 @@ class EventCode(StrEnum):
     RESPONSE = "envelope-response"  # positions show an acceleration that nothing explains
     VELOCITY = "envelope-velocity"  # positions move otherwise than the vehicle says
     SCATTER = "envelope-scatter"  # positions scatter more than the vehicle can move
-    SETPOINT_RESPONSE = "envelope-setpoint-response"  # the vehicle answers setpoints otherwise than they say
+    SETPOINT_RESPONSE = "envelope-setpoint-response"  # the vehicle does not answer setpoints as they say
     BRAKING = "envelope-braking"  # braking has no effect
     # Causes to brake, or to distrust a source; no event of their own
     POSITIONS_ABSURD = "positions-absurd"  # all positions are further out than any can be

@@ -12,7 +12,7 @@ _HEADER_NAME = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
 
 
 @dataclass(frozen=True)
-class RefusedError(Exception):
+class RequestRefusedError(Exception):
     """A request that is refused, with the status and the reason of the answer."""
 
     status: HTTPStatus
@@ -37,17 +37,17 @@ def parse_request(head: bytes) -> Request:
     """Read the head of a request; values of a header that comes twice are joined by a comma.
 
     Raises:
-        RefusedError: It is not HTTP.
+        RequestRefusedError: It is not HTTP.
     """
     first, *lines = head.decode("latin-1").rstrip("\r\n").split("\r\n")
     words = first.split(" ")
     if len(words) != 3 or not words[2].startswith("HTTP/1."):
-        raise RefusedError(HTTPStatus.BAD_REQUEST, "this is not HTTP 1")
+        raise RequestRefusedError(HTTPStatus.BAD_REQUEST, "this is not HTTP 1")
     headers: dict[str, str] = {}
     for line in lines:
         name, colon, value = line.partition(":")
         if not colon or not _HEADER_NAME.fullmatch(name):
-            raise RefusedError(HTTPStatus.BAD_REQUEST, "a header has no name")
+            raise RequestRefusedError(HTTPStatus.BAD_REQUEST, "a header has no name")
         name, value = name.lower(), value.strip(" \t")
         headers[name] = f"{headers[name]}, {value}" if name in headers else value
     return Request(words[0], words[1], headers)
@@ -63,20 +63,22 @@ def check_request(request: Request, token: str) -> None:
         token: A WebSocket with this path may be opened by the page of any site, as its user has entered the token.
 
     Raises:
-        RefusedError: It is refused.
+        RequestRefusedError: It is refused.
     """
     host = request.headers.get("host", "")
     if not _LOCAL_HOST.fullmatch(host):
-        raise RefusedError(HTTPStatus.FORBIDDEN, "ask by the name localhost or 127.0.0.1; other names are refused")
+        raise RequestRefusedError(
+            HTTPStatus.FORBIDDEN, "ask by the name localhost or 127.0.0.1; other names are refused"
+        )
     if request.method != "GET":
-        raise RefusedError(HTTPStatus.METHOD_NOT_ALLOWED, "nothing can be written here; GET alone is allowed")
+        raise RequestRefusedError(HTTPStatus.METHOD_NOT_ALLOWED, "nothing can be written here; GET alone is allowed")
     origin = request.headers.get("origin")
     is_same_site = origin is None or origin.lower() == f"http://{host.lower()}"
     has_token = request.asks_for_websocket and hmac.compare_digest(request.path.encode(), f"/{token}".encode())
     if not is_same_site and not has_token:
-        raise RefusedError(
+        raise RequestRefusedError(
             HTTPStatus.FORBIDDEN, "pages of other sites are refused; the address with the token is on the console"
         )
     paths = ("/", f"/{token}") if request.asks_for_websocket else ("/", "/live.js", "/scenes")
     if request.path not in paths:
-        raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")
+        raise RequestRefusedError(HTTPStatus.NOT_FOUND, "there is no such page")

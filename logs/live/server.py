@@ -13,7 +13,7 @@ from http import HTTPStatus
 from pathlib import Path
 
 from logs.live.foxglove import SUBPROTOCOLS, Subscriber, make_advertisement, make_server_info
-from logs.live.request import RefusedError, Request, check_request, parse_request
+from logs.live.request import Request, RequestRefusedError, check_request, parse_request
 from logs.live.websocket import Opcode, WebSocketError, make_frame, make_handshake, read_frame
 from logs.recording.topics import Definition
 
@@ -88,7 +88,7 @@ class LiveServer:
                 try:
                     request = await self._read_request(reader)
                     await self._answer(request, reader, writer)
-                except RefusedError as refused:
+                except RequestRefusedError as refused:
                     text = f"{refused.reason}\n".encode()
                     await _send(writer, _make_head(refused.status, "text/plain; charset=utf-8", len(text)) + text)
         finally:
@@ -99,7 +99,7 @@ class LiveServer:
             async with asyncio.timeout(PATIENCE_S):
                 head = await reader.readuntil(b"\r\n\r\n")
         except asyncio.LimitOverrunError:
-            raise RefusedError(
+            raise RequestRefusedError(
                 HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, f"a request has at most {MAX_HEAD_BYTES} bytes"
             ) from None
         request = parse_request(head)
@@ -113,7 +113,7 @@ class LiveServer:
             await _send(writer, _make_head(HTTPStatus.OK, kind, len(data)) + data)
             return
         if self._viewers >= MAX_VIEWERS:
-            raise RefusedError(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_VIEWERS} viewers are connected")
+            raise RequestRefusedError(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_VIEWERS} viewers are connected")
         handshake = make_handshake(request, SUBPROTOCOLS) if request.asks_for_websocket else b""
         task = asyncio.current_task()
         if task is not None:

@@ -8,7 +8,7 @@ import hashlib
 from enum import IntEnum
 from http import HTTPStatus
 
-from logs.live.request import RefusedError, Request
+from logs.live.request import Request, RequestRefusedError
 
 VERSION = "13"
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # of RFC 6455, section 1.3
@@ -37,13 +37,13 @@ def make_handshake(request: Request, subprotocols: tuple[str, ...]) -> bytes:
         subprotocols: Those that the server speaks, the best first.
 
     Raises:
-        RefusedError: The client speaks none of them, or another version.
+        RequestRefusedError: The client speaks none of them, or another version.
     """
     key = request.headers.get("sec-websocket-key")
     offered = [name.strip() for name in request.headers.get("sec-websocket-protocol", "").split(",")]
     chosen = next((name for name in subprotocols if name in offered), None)
     if key is None or request.headers.get("sec-websocket-version") != VERSION or chosen is None:
-        raise RefusedError(
+        raise RequestRefusedError(
             HTTPStatus.BAD_REQUEST, f"a WebSocket of version {VERSION} with {' or '.join(subprotocols)} is needed"
         )
     accept = base64.b64encode(hashlib.sha1(key.encode() + _GUID, usedforsecurity=False).digest()).decode()

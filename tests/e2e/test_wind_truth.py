@@ -189,9 +189,7 @@ def test_positions_that_turn_in_a_wind_are_found_and_held_back(autopilot: str) -
     assert max(flight.relayed_s) < 8.5
 
 
-# A real autopilot's software in wind: what was recorded of a flight that was let go.
-
-STEADY = "px4-sih-relay-steady-wind"
+STEADY = "px4-sih-relay-steady-wind"  # flight of a real autopilot's software that was let go
 TICK_NS = 50_000_000
 NO_VELOCITY: Vec3 = (math.nan, math.nan, math.nan)
 

@@ -273,6 +273,31 @@ def fly_deceived(
     return flight
 
 
+def _choose_autopilot(seed: int) -> tuple[str, str]:
+    """Choose the autopilot and its preset; both take turns."""
+    autopilot = ("px4", "ardupilot")[seed % 2]
+    return autopilot, (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
+
+
+def _load_world(
+    seed: int, rng: np.random.Generator, waypoints: str, duration_s: float, overrides: Sequence[str] = ()
+) -> Config:
+    """Load the configuration of the world that is flown in, with gusts."""
+    autopilot, preset = _choose_autopilot(seed)
+    return load_config(
+        preset,
+        [
+            f"sim.autopilot={autopilot}",
+            f"sim.seed={seed}",
+            "sim.plant=quadrotor",
+            f"mission.waypoints=[{waypoints}]",
+            f"sim.wind.gust_wind_mps={rng.uniform(0.0, 3.0):.2f}",
+            f"duration_s={duration_s}",
+            *overrides,
+        ],
+    )
+
+
 def _draw_waypoints(rng: np.random.Generator, preset: str, autopilot: str) -> str:
     believed, _ = prepare_believed(preset, autopilot)
     lower = [believed.sets.state_lower[i * (len(believed.sets.state_lower) // 3)] for i in range(3)]
@@ -288,8 +313,7 @@ def _draw_waypoints(rng: np.random.Generator, preset: str, autopilot: str) -> st
 def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float]:
     """Draw a flight: preset, autopilot, gusts, path between walls, a blackout, and one or two deceptions."""
     rng = np.random.default_rng([seed, 39])
-    autopilot = ("px4", "ardupilot")[seed % 2]
-    preset = (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
+    autopilot, preset = _choose_autopilot(seed)
     waypoints = _draw_waypoints(rng, preset, autopilot)
     blackout_s = float(rng.uniform(3.0, 10.0))
     size = 1 + int(rng.random() < 0.5)
@@ -302,18 +326,8 @@ def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception],
         )
         for source in sources
     ]
-    config = load_config(
-        preset,
-        [
-            f"sim.autopilot={autopilot}",
-            f"sim.seed={seed}",
-            "sim.plant=quadrotor",
-            f"mission.waypoints=[{waypoints}]",
-            f"sim.wind.gust_wind_mps={rng.uniform(0.0, 3.0):.2f}",
-            f"link.blackout=[[{blackout_s}, {blackout_s + BLACKOUT_S}]]",
-            f"duration_s={blackout_s + BLACKOUT_S + AFTER_S}",
-        ],
-    )
+    blackout = f"link.blackout=[[{blackout_s}, {blackout_s + BLACKOUT_S}]]"
+    config = _load_world(seed, rng, waypoints, blackout_s + BLACKOUT_S + AFTER_S, (blackout,))
     believed, controller = prepare_believed(preset, autopilot, (f"mission.waypoints=[{waypoints}]",))
     return config, believed, controller, deceptions, blackout_s
 
@@ -321,20 +335,9 @@ def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception],
 def draw_response_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float | None]:
     """Draw a flight between walls whose response is wrong from a moment on: no blackout."""
     rng = np.random.default_rng([seed, 40])
-    autopilot = ("px4", "ardupilot")[seed % 2]
-    preset = (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
+    autopilot, preset = _choose_autopilot(seed)
     waypoints = _draw_waypoints(rng, preset, autopilot)
     at_s = float(rng.uniform(2.5, 14.0))
-    config = load_config(
-        preset,
-        [
-            f"sim.autopilot={autopilot}",
-            f"sim.seed={seed}",
-            "sim.plant=quadrotor",
-            f"mission.waypoints=[{waypoints}]",
-            f"sim.wind.gust_wind_mps={rng.uniform(0.0, 3.0):.2f}",
-            f"duration_s={at_s + AFTER_S}",
-        ],
-    )
+    config = _load_world(seed, rng, waypoints, at_s + AFTER_S)
     believed, controller = prepare_believed(preset, autopilot, (f"mission.waypoints=[{waypoints}]",))
     return config, believed, controller, [Deception("response", str(rng.choice(RESPONSES)), at_s)], None

@@ -39,8 +39,8 @@ REASONS = {
     "out of order": "positions come that are older than those before",
     "rate": "stamps of positions do not go on",
     "no clock": "stamps of positions are from before the vehicle's start",
-    TILTED: "poses are tilted otherwise than the vehicle",
-    TURNED: "poses turn otherwise than the vehicle",
+    TILTED: "the tilt of poses is not the vehicle's",
+    TURNED: "the turn of poses is not the vehicle's",
 }
 WRONG_ATTITUDES = 5  # poses with a wrong attitude within `ATTITUDE_NS`: a fault, and no outlier
 ATTITUDE_NS = 1_000_000_000

@@ -1,8 +1,8 @@
 """Attitude of relayed poses against the vehicle's own sensors. Pure; time is an argument.
 
 1. Compare the direction of down in body axes with the vehicle's own. Gravity shows it to a vehicle without cameras.
-2. Compare the change of heading with the integral of the vehicle's gyroscopes. The vehicle's own heading is no
-   witness: it may come from the very poses that are checked, and turns with them.
+2. Compare the change of heading with the integral of the vehicle's gyroscopes. The vehicle's own heading is not
+   independent: it may come from the very poses that are checked, and turns with them.
 3. Without data of the vehicle: compare with the last accepted pose. No vehicle turns faster than `MAX_TURN_RPS`.
 
 PX4 and ArduPilot use the attitude of VISION_POSITION_ESTIMATE and ODOMETRY for the heading. PX4 also turns positions by

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from live_rig import HANDSHAKE, make_head
 
-from logs.live.request import RefusedError, check_request, parse_request
+from logs.live.request import RequestRefusedError, check_request, parse_request
 from logs.live.websocket import LARGEST, Opcode, WebSocketError, make_handshake, read_frame
 
 TOKEN = "t0ken"
@@ -24,7 +24,7 @@ def check(**changes: str) -> HTTPStatus:
     headers = {"Host": "localhost:8765", **changes}
     try:
         check_request(parse_request(make_head(headers, path, method)), TOKEN)
-    except RefusedError as refused:
+    except RequestRefusedError as refused:
         return refused.status
     return HTTPStatus.OK
 
@@ -57,7 +57,7 @@ def test_98_only_this_machine_s_names_are_a_host(host: str, status: int) -> None
 @pytest.mark.fault(98)
 def test_98_a_host_that_comes_twice_is_none() -> None:
     head = b"GET / HTTP/1.1\r\nHost: localhost\r\nhost: localhost\r\n\r\n"
-    with pytest.raises(RefusedError) as refused:
+    with pytest.raises(RequestRefusedError) as refused:
         check_request(parse_request(head), TOKEN)
     assert refused.value.status == 403
 
@@ -106,7 +106,7 @@ def test_any_bytes_are_a_request_or_refused(data: bytes) -> None:
             request = parse_request(head + b"\r\n\r\n")
             check_request(request, TOKEN)
             make_handshake(request, ("foxglove.sdk.v1",))
-        except RefusedError as refused:
+        except RequestRefusedError as refused:
             assert 400 <= refused.status < 500
 
 
@@ -114,7 +114,7 @@ def test_any_bytes_are_a_request_or_refused(data: bytes) -> None:
 def test_a_handshake_that_lacks_a_header_is_refused(name: str) -> None:
     headers = {key: value for key, value in HANDSHAKE.items() if key != name}
     assert make_handshake(parse_request(make_head(HANDSHAKE)), ("foxglove.sdk.v1",))
-    with pytest.raises(RefusedError):
+    with pytest.raises(RequestRefusedError):
         make_handshake(parse_request(make_head(headers)), ("foxglove.sdk.v1",))
 
 

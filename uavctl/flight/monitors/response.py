@@ -3,7 +3,7 @@
 1. The acceleration a is shown by inertial data; without them, by changes of the vehicle's own velocity. The setpoints
    give u, behind the vehicle's lag. All is horizontal.
 2. Each hypothesis predicts a = R u - c v + d, with drag c of the velocity v, and wind d. A right response has R = g I,
-   with a gain g of 0.7 to 1.5, and may be up to 0.15 s late: nobody has identified each vehicle.
+   with a gain g of 0.7 to 1.5, and may be up to 0.15 s late: the model of a vehicle is rarely exact.
 3. What a hypothesis leaves is a - R u + c v. Its variance V over the last half second counts, and the jump J of its
    mean since the last seconds: a wind that sets in makes one, too. Older samples are forgotten.
 4. The evidence for a wrong response is the log-likelihood ratio of V and J against those of a right one.
@@ -49,7 +49,7 @@ FAR_S = 1.0
 # inertial data and the own velocity that begin to err together would be taken for a wrong response.
 UNCERTAIN, SILENT_NS = 3.0, 400_000_000
 REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
-GAINS = (1.0, 0.7, 1.5)  # of a right response: a vehicle that nobody has identified
+GAINS = (1.0, 0.7, 1.5)  # of a right response: the model of a vehicle is rarely exact
 LATE_NS, TOO_LATE_NS = 150_000_000, 300_000_000  # delays beyond the vehicle's lag: of a right response, of a wrong one
 
 Pair = tuple[float, float]  # north, east
