@@ -8,12 +8,15 @@ from deception_rig import draw_flight, fly_deceived
 OUTSIDE_M = 0.5  # beyond a wall or the ceiling
 # Seeds that went furthest outside before both velocities were compared: by 2.0 to 4.0 m.
 WORST = (6, 33, 72, 74, 90, 111, 129, 183, 210, 287, 290)
+# The same before positions were compared with both others: by 0.5 to 2.0 m. Positions are late, scaled, swapped or
+# flipped when they come back; in the last one nothing but the prediction is right.
+CAME_BACK = (53, 3051, 6004, 6019, 6021, 6035, 7006)
 
 
 @pytest.mark.slow
 @pytest.mark.fault(94)
 @pytest.mark.fault(95)
-@pytest.mark.parametrize("seed", WORST)
+@pytest.mark.parametrize("seed", WORST + CAME_BACK)
 def test_the_true_vehicle_stays_near_the_room(seed: int) -> None:
     flight = fly_deceived(*draw_flight(seed))
     assert flight.outside_m <= OUTSIDE_M + 0.05 and flight.begin_mps > 0.2

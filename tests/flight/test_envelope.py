@@ -151,6 +151,21 @@ def test_braking_has_to_show(speeds: list[tuple[int, float | None]], ends: tuple
     assert {breach.cause for _, breach in breaches} <= {EventCode.BRAKING}
 
 
+@pytest.mark.parametrize(("slows", "found"), [(True, []), (False, [1700])])
+@pytest.mark.fault(43)
+def test_braking_counts_from_when_the_setpoint_points_against_the_velocity(slows: bool, found: list[int]) -> None:
+    """The setpoint of a plan that accelerates is slew-limited: the vehicle goes on gaining speed while it turns."""
+    watching, breaches = INITIAL, []
+    for now_ms in range(0, 1750, 50):
+        at_ns, turned_ms = START_NS + now_ms * MS, now_ms - 700
+        speed = 1.4 + 0.001 * min(now_ms, 700) - (0.001 if slows else 0.00001) * max(turned_ms, 0)
+        sent = (2.0, 0.0, 0.0) if turned_ms < 0 else (-2.0, 0.0, 0.0)
+        ours = seen(at_ns, sent=sent, vehicle_motion=motion((speed, 0.0, 0.0), at_ns))
+        watching, breach = update(watching, structs.replace(ours, braking=True), PARAMETERS)
+        breaches += [] if breach is None else [now_ms]
+    assert breaches == found
+
+
 @pytest.mark.parametrize(("for_ns", "breached"), [(10**9 - 1, False), (10**9, True), (10**9 + 1, True)])
 def test_braking_has_a_second_to_show(for_ns: int, breached: bool) -> None:
     for north, fast in ((0.3, False), (just_more(0.3), True)):

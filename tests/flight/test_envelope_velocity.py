@@ -160,6 +160,24 @@ def test_a_distance_that_begins_anew_is_not_compared_with_what_was_before(known:
         assert kept == (is_kept and "offsets" in known, is_kept and "places" in known)
 
 
+@pytest.mark.parametrize(
+    ("silent_s", "off_m", "ends"), [(1.5, 0.42, False), (1.5, 0.45, True), (4.0, 1.26, False), (4.0, 1.3, True)]
+)
+@pytest.mark.fault(95)
+def test_positions_come_back_near_the_vehicle_s_own_way(silent_s: float, off_m: float, ends: bool) -> None:
+    """It flies on at 0.5 m/s in a silence, by its own velocity, and positions come back beside that way."""
+    unbounded = replace(PARAMETERS, unexplained_mps2=1e3)
+    watching, causes, silent = INITIAL, [], range(20, 20 + round(silent_s / 0.05))
+    for tick in range(silent.stop + 1):
+        at_ns = START_NS + tick * 50 * MS
+        where = (0.5 * tick * 0.05, 0.0 if tick < silent.stop else off_m, 0.0)
+        taken = () if tick in silent else (sample(at_ns, at_ns, where),)
+        ours = seen(at_ns, *taken, vehicle_motion=motion((0.5, 0.0, 0.0), at_ns))
+        watching, breach = update(watching, ours, unbounded)
+        causes += [] if breach is None else [(tick, breach.cause)]
+    assert causes == ([(silent.stop, EventCode.VELOCITY)] if ends else [])
+
+
 # The ways of half a minute
 
 

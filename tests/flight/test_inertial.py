@@ -10,6 +10,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from envelope_rig import PARAMETERS, motion
 from flight_rig import (
     DT_NS,
     HORIZON,
@@ -32,6 +33,7 @@ from scipy.linalg import expm
 
 from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import load_config
+from uavctl.event_codes import EventCode
 from uavctl.flight.act import find_return_accel
 from uavctl.flight.context import locate_on_grid, view_filter
 from uavctl.flight.controller import Controller
@@ -485,6 +487,41 @@ def test_a_fallback_holds_by_inertial_data_against_a_force_that_it_would_not_kno
         assert decided[-1].mode in ("land", "stopped")
     landed = [next(i for i, one in enumerate(d) if one.mode == "land") for d in (blindly, felt_ones)]
     assert landed[0] <= landed[1]
+
+
+def swing(late_s: float) -> list[TickOutput]:
+    """Ticks of a vehicle that swings; its positions come late by so much from 2 s on, and two other sources do not."""
+    envelope = replace(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3)
+    controller = replace(controller_that_feels(bias_max=3.0, bias_drift=3.0), envelope=envelope)
+    # a = A cos(ω t), v = A/ω sin(ω t), p = A/ω² (1 - cos(ω t))
+    omega, accel_mps2 = 2.0, 2.0
+    state, told = make_initial_state(), []
+    for tick in range(3 * 20):
+        at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
+        shown_s = s - (late_s if s >= 2.0 else 0.0)
+        north_m = accel_mps2 / omega**2 * (1.0 - math.cos(omega * shown_s))
+        given = StepInput(
+            tick=tick,
+            at_ns=at_ns,
+            samples=(sample(at_ns, position_m=(north_m, 0.0, 0.0)),),
+            vehicle=vehicle(),
+            motion=motion((accel_mps2 / omega * math.sin(omega * s), 0.0, 0.0), at_ns),
+            inertial=felt_at(at_ns - MS, accel_mps2 * math.cos(omega * s)),
+        )
+        state, one = run_tick(state, given, controller)
+        told.append(one)
+    return told
+
+
+@pytest.mark.fault(94)
+def test_positions_are_wrong_where_inertial_data_and_the_vehicle_s_own_velocity_change_alike() -> None:
+    braked = {}
+    for late_s in (0.0, 0.3):
+        told = swing(late_s)
+        braked[late_s] = [0.05 * tick for tick, one in enumerate(told) if one.decision.mode == "brake"]
+        assert not any(event.code == EventCode.INERTIAL_DOUBTED for one in told for event in one.events)
+    assert not braked[0.0]
+    assert 2.0 < min(braked[0.3]) < 2.5
 
 
 def test_a_fallback_that_ends_holds_by_nothing() -> None:

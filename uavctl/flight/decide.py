@@ -38,7 +38,7 @@ from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
-from uavctl.flight.supervise import Supervised, observe_velocity
+from uavctl.flight.supervise import LOST_NS, Supervised, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
 
@@ -361,7 +361,8 @@ def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     """Advance the fallback to this tick."""
     state, context, view = phase.state, phase.context, phase.view
     moving, measured = find_braking_velocity(state, context, phase.supervised)
-    carries = carries_estimate(fallback, view.belief)
+    is_predicted = not (measured or carries_estimate(fallback, view.belief))
+    is_silent = view.belief is None or context.at_ns - view.belief.captured_ns > LOST_NS
     return advance_fallback(
         fallback,
         context.at_ns,
@@ -370,7 +371,8 @@ def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
         context.controller.fallback,
         find_hold_accel(fallback, begun.biases, context, phase.supervised),
         measured=measured,
-        blind=not (measured or carries) and (view.age_steps is None or view.age_steps >= context.controller.horizon),
+        predicted=is_predicted and is_silent,
+        blind=is_predicted and (view.age_steps is None or view.age_steps >= context.controller.horizon),
     )
 
 

@@ -32,6 +32,8 @@ from uavctl.records import ControlMode, Vec3
 
 SETTLE_S = 1.0  # longest time in which the setpoint limiter reaches zero
 STILL_MPS = 0.02  # below this speed the vehicle is at rest
+# The same of a prediction that nothing measures: it is no better than this. An error would be braked on for seconds.
+PREDICTED_STILL_MPS = 0.1
 DRIFT_MPS = 0.15  # above this speed, by its own velocity, a vehicle that holds drifts
 CALM_MPS2 = 0.04  # HOLD begins when the setpoint is this close to its own
 RETURN_GAIN_1PS2, RETURN_GAIN_1PS = 1.0, 1.5  # gains of distance and speed on the way back: two seconds
@@ -111,6 +113,7 @@ def advance_fallback(
     hold_accel_mps2: Vec3 = ZERO,
     *,
     measured: bool = False,
+    predicted: bool = False,
     blind: bool = False,
 ) -> Fallback:
     """Advance the fallback to `at_ns`, with all transitions that are due.
@@ -121,6 +124,7 @@ def advance_fallback(
         sent_mps2: The setpoint of the tick before [m/s²].
         hold_accel_mps2: What HOLD sends [m/s²].
         measured: Whether the speed is the vehicle's own velocity, not a prediction.
+        predicted: Whether it is a prediction that no recent position, and no inertial data, carry on.
         blind: Whether it is a prediction without a recent position: nothing shows a drift.
     """
     mode = fallback.mode
@@ -133,9 +137,9 @@ def advance_fallback(
     hold_s = min(parameters.hold_s, parameters.blind_hold_s) if blind else parameters.hold_s
     due = (mode is ControlMode.HOLD or fallback.held_ns is not None) and (at_ns - held_ns) * 1e-9 >= hold_s
     if mode is ControlMode.BRAKE and not due:
-        slow = speed_mps < STILL_MPS or elapsed_s >= parameters.brake_s
+        slow = speed_mps < (PREDICTED_STILL_MPS if predicted else STILL_MPS) or elapsed_s >= parameters.brake_s
         off_mps2 = max(abs(sent - held) for sent, held in zip(sent_mps2, hold_accel_mps2, strict=True))
-        if slow and (off_mps2 <= CALM_MPS2 or elapsed_s >= parameters.brake_s + SETTLE_S):
+        if slow and (predicted or off_mps2 <= CALM_MPS2 or elapsed_s >= parameters.brake_s + SETTLE_S):
             held_ns = at_ns if fallback.held_ns is None else held_ns
             return replace(fallback, mode=ControlMode.HOLD, since_ns=at_ns, held_ns=held_ns)
         return fallback

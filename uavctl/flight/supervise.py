@@ -9,6 +9,7 @@ This is the only table from verdicts to actions. Phase 1 acts on those about sin
     sources, in WAIT  end plans, all absurd     drop since consistent  -                      ENVELOPE
     external          end plans, too slow       -                      -                      CONTROLLER_FAILED
     external          end plans, near a wall    -                      -                      the same, in phase 4
+    estimate          brake                     drop since consistent  -                      BRAKE while a plan flies
     inertial          distrust inertial data    -                      drop since the newest  replan
                                                                        position
     outliers          brake, positions jumped   refused (phase 1)      -                      BRAKE while a plan flies
@@ -22,7 +23,8 @@ This is the only table from verdicts to actions. Phase 1 acts on those about sin
 "Consistent" is the capture time of the last position with which all monitors of the motion agreed
 (`MonitorState.consistent_ns`). Positions that are lost make the age grow; at the horizon the fallback brakes.
 
-1. Inertial data are compared with the vehicle's own velocity.
+1. Inertial data are compared with the vehicle's own velocity. Where both change alike, positions that contradict them
+   are wrong.
 2. While we fly, the motion is watched; while others fly an armed vehicle, its positions are compared with its inertial
    data, or with its own velocity.
 3. Data that are distrusted are dropped from the filter, and the estimate is made anew.
@@ -76,6 +78,10 @@ _CONTRADICTED = brake(
     EventCode.PREDICTION_INCONSISTENT,
     "the vehicle's velocity and its inertial data contradict each other, and no position comes",
 )
+_POSITIONS_CONTRADICTED = brake(
+    EventCode.PREDICTION_INCONSISTENT,
+    "positions contradict both the vehicle's velocity and its inertial data, which change alike",
+)
 _CARRIED_BY_NOTHING = brake(EventCode.PREDICTION_INCONSISTENT, "neither positions nor inertial data come any more")
 _ABSURD_SO_FAR = brake(
     EventCode.POSITIONS_ABSURD,
@@ -122,15 +128,17 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
     """Run the monitors, and turn their verdicts into actions."""
     controller, at_ns, samples = context.controller, context.at_ns, measured.samples
     view = view_filter(measured.history, context)
-    inertial_verdict = _judge_inertial(state, view, context)
+    contradiction, inertial_verdict = _judge_estimate(state, view, measured, context)
     if not inertial_verdict.is_none:
         view = view_filter(distrust_inertial(view.history, at_ns), context)
     return_ordered = _is_return_ordered(state, view, context)
     monitors, breach = _watch_flight(state, view, measured, context, return_ordered)
     sources = _judge_sources(measured, context)
     dropped_after_ns, consecutive = samples.dropped_after_ns, samples.consecutive_samples
-    if not (breach.is_none and sources.is_none):
-        dropped_after_ns, consecutive = min(dropped_after_ns or at_ns, monitors.consistent_ns or at_ns), 0
+    if not (breach.is_none and sources.is_none and contradiction.is_none):
+        # A position that contradicts two sources goes, too, though the monitors of the motion agree with it.
+        newest_ns = at_ns if contradiction.is_none or view.belief is None else view.belief.captured_ns - 1
+        dropped_after_ns, consecutive = min(dropped_after_ns or at_ns, monitors.consistent_ns or at_ns, newest_ns), 0
         view = view_filter(_drop_after(view.history, dropped_after_ns), context)
     if context.is_boundary and view.age_steps is not None and view.age_steps >= controller.horizon:
         consecutive = 0
@@ -156,7 +164,7 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
         consecutive_samples=consecutive,
         breach=None if breach.is_none else breach,
         fallback_reasons=tuple(_FALLBACK_REASONS[verdict.cause] for verdict in ending if verdict.cause is not None),
-        brake=_judge_plan(state, monitors, samples.sources, view, context),
+        brake=_judge_plan(state, monitors, samples.sources, view, context) if contradiction.is_none else contradiction,
         plan_base=plan_base,
         wall=_judge_wall(state, plan_base, context),
         dropped_after_ns=dropped_after_ns,
@@ -173,14 +181,25 @@ def _drop_after(history: FilterHistory, dropped_after_ns: int) -> FilterHistory:
     return drop_samples(history, lambda sample: read_capture_ns(sample) > dropped_after_ns)
 
 
-def _judge_inertial(state: ControlState, view: FilterView, context: TickContext) -> Verdict:
-    """Judge inertial data that carry the estimate on without a position."""
+def _judge_estimate(
+    state: ControlState, view: FilterView, measured: Measured, context: TickContext
+) -> tuple[Verdict, Verdict]:
+    """Judge which source is wrong where the estimate contradicts inertial data or the vehicle's own velocity.
+
+    Recent positions are, where both others change alike; else inertial data are. Return the verdict of each.
+    """
     belief, change = view.belief, state.monitors.engaged.velocity_change
     if belief is None:
-        return NO_VERDICT
-    consistent = change.inertial_wrong_ns is None and not _has_drifted(state, belief, view, context)
+        return NO_VERDICT, NO_VERDICT
+    has_drifted = change.inertial_wrong_ns is None and _has_drifted(state, belief, view, context)
+    knows_noise = measured.samples.sources.noise.is_known
+    if context.was_in_control and knows_noise and change.supports_velocity(context.at_ns):
+        is_new = any(read_capture_ns(sample) == belief.inertial.distrusted_ns for sample in measured.samples.accepted)
+        if is_new or (has_drifted and (view.age_steps or 0) < PLAYED_OUT_STEPS):
+            return _POSITIONS_CONTRADICTED, NO_VERDICT
+    consistent = change.inertial_wrong_ns is None and not has_drifted
     comparison = InertialObservation(ComparedSource.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
-    return inertial.update(belief.inertial, comparison)[1]
+    return NO_VERDICT, inertial.update(belief.inertial, comparison)[1]
 
 
 def _has_drifted(state: ControlState, belief: Belief, view: FilterView, context: TickContext) -> bool:

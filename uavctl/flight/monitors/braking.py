@@ -1,6 +1,7 @@
 """Monitor: does braking slow the vehicle down, by its own velocity?
 
-1. The speed is noted when braking begins, and again where positions come back after a silence.
+1. The speed is noted when braking begins: once the setpoint, which is slew-limited, points against the velocity. It is
+   noted again where positions come back after a silence.
 2. A second later the speed is more than 0.8 of it, and 0.3 m/s. Then: end the plans.
 
 False alarms (docs/soak.md): 0 of 200 missions.
@@ -48,6 +49,9 @@ def update(
         return state, NO_VERDICT
     speed_mps = math.hypot(*velocity)
     if state.began is None:
+        # u' v > 0: the setpoint of the plan before still accelerates the vehicle
+        if sum(u * v for u, v in zip(tick.sent_mps2, velocity, strict=True)) > 0.0:
+            return state, NO_VERDICT
         return BrakingState((tick.at_ns, speed_mps), state.resumed_ns), NO_VERDICT
     since_ns, began_mps = state.began
     # v > 0.8 v_0 + 0.3 m/s
