@@ -79,7 +79,7 @@ def test_true_ones_agree_and_support_the_velocity() -> None:
 def test_a_wrong_velocity_is_found(lie: Callable[[float, float], float], within_s: float, begin_s: float) -> None:
     states = fly(60, lambda s, v: lie(s, v) if s >= begin_s else v, true)
     found = [round(tick * 0.05, 2) for tick, state in enumerate(states) if is_found(state) == (True, False)]
-    assert found and begin_s < found[0] <= begin_s + within_s
+    assert found and begin_s <= found[0] <= begin_s + within_s
     assert is_found(states[-1]) == (True, False) and not states[-1].supports_velocity(START_NS + 59 * TICK_NS)
 
 
@@ -102,6 +102,14 @@ def test_a_velocity_that_repeats_is_found_without_inertial_data_but_not_at_rest(
     assert is_found(frozen[-1]) == (True, False)
     moving = fly(40, true, lambda _s, _a: None)
     assert is_found(moving[-1]) == (False, False)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(("leap_mps", "is_wrong"), [(0.45, False), (0.55, True), (-0.55, True)])
+def test_a_velocity_that_leaps_is_found_in_that_message_without_inertial_data(leap_mps: float, is_wrong: bool) -> None:
+    states = fly(40, lambda s, v: v + (leap_mps if s >= LAG_S else 0.0), lambda _s, _a: None)
+    found = [tick for tick, state in enumerate(states) if is_found(state) == (True, False)]
+    assert found[:1] == ([round(LAG_S / 0.05)] if is_wrong else [])
 
 
 def test_nothing_is_compared_while_positions_correct_the_velocity() -> None:

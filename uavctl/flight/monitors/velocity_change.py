@@ -4,8 +4,9 @@
    velocity (Δv), the integral of its inertial data (Δi), and what the setpoints give (Δm). None needs a position.
 2. Δv and Δi that are near each other are both right: then positions that contradict them are wrong.
 3. Else the one that is further from Δm is wrong, with or without the acceleration d that positions showed last beside
-   the setpoints; both are, if both are further than gusts explain.
-4. An own velocity that repeats to the last bit while Δm grows is wrong, too.
+   the setpoints; both are, if both are further than gusts explain. Where Δv is known to be wrong, only Δi is compared.
+4. An own velocity that repeats to the last bit while Δm grows is wrong, too. So is one that leaps from one message to
+   the next by more than Δm and gusts explain.
 
 A wrong velocity is not braked on, and wrong inertial data do not carry the estimate on. Where no position comes, the
 vehicle brakes (`uavctl.flight.supervise`). Wrong inertial data are compared again after three seconds, a wrong velocity
@@ -33,6 +34,9 @@ PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one messa
 INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 RECENT_NS = 300_000_000  # an agreement counts for so long
+LEAP = (
+    2.0  # disagreements by which a velocity leaps from one message to the next: no force does that in so short a time
+)
 
 Sample = tuple[int, Vector, Vector, Vector]  # time [ns]; own velocity, integral of inertial data, model's [m/s]
 
@@ -67,7 +71,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     is_corrected = motion.resumed_ns is not None and tick.at_ns < motion.resumed_ns + CORRECTS_NS
     if own is None or own_ns is None or is_corrected:
         return replace(state, samples=(), disagrees_ns=None, repeated=None)
-    state = _find_repeats(state, own, motion.model_mps, tick.at_ns, parameters)
+    state = _judge_alone(state, own, motion.model_mps, tick.at_ns, parameters)
     if not motion.inertial_path or tick.inertial_mps2 is None:
         return replace(state, samples=(), disagrees_ns=None)
     if state.samples and state.samples[-1][0] >= own_ns:
@@ -76,7 +80,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     kept = tuple(sample for sample in state.samples if own_ns - sample[0] <= WINDOW_NS)
     sample = (own_ns, own, tuple(gained), motion.model_mps)
     state = replace(state, samples=(*kept, sample))
-    if state.velocity_wrong_ns is not None or state.inertial_wrong_ns is not None:
+    if state.inertial_wrong_ns is not None:
         return state
     unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
     return _compare(state, kept[0] if kept else sample, sample, unexplained, tick.at_ns, parameters)
@@ -97,8 +101,9 @@ def _compare(
     """
     s = (last[0] - first[0]) * 1e-9
     own, gained, model = (_subtract(now, then) for now, then in zip(last[1:], first[1:], strict=True))
+    knows_wrong = state.velocity_wrong_ns is not None
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t
-    if math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
+    if not knows_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
         return replace(state, agreed_ns=at_ns, disagrees_ns=None)
     disagrees_ns = at_ns if state.disagrees_ns is None else state.disagrees_ns
     if at_ns - disagrees_ns < PERSISTS_NS:
@@ -108,6 +113,8 @@ def _compare(
     own_mps, gained_mps = (min(math.dist(shown, model), math.dist(shown, pushed)) for shown in (own, gained))
     # v_max + gusts(t)
     explained_mps = 2.0 * (parameters.disagreement_mps + bound_gusts_mps(s, parameters))
+    if knows_wrong:
+        return replace(state, inertial_wrong_ns=at_ns if gained_mps > explained_mps else None)
     are_both_wrong = min(own_mps, gained_mps) > explained_mps
     return replace(
         state,
@@ -117,13 +124,21 @@ def _compare(
     )
 
 
-def _find_repeats(
+def _judge_alone(
     state: VelocityChangeState, own: Vector, model: Vector, at_ns: int, parameters: EnvelopeParameters
 ) -> VelocityChangeState:
-    """Find an own velocity that repeats to the last bit while that by the setpoints changes."""
-    if state.repeated is None or state.repeated[0] != own:
+    """Find an own velocity that repeats to the last bit while that by the setpoints changes, or that leaps."""
+    if state.repeated is None:
         return replace(state, repeated=(own, model))
-    if math.dist(model, state.repeated[1]) <= parameters.disagreement_mps or state.velocity_wrong_ns is not None:
+    before, model_before = state.repeated
+    # Repeats: |Δm| > v_max; leaps: |Δv - Δm| > 2 v_max
+    if own == before:
+        is_wrong = math.dist(model, model_before) > parameters.disagreement_mps
+    else:
+        off_mps = math.dist(_subtract(own, before), _subtract(model, model_before))
+        is_wrong = off_mps > LEAP * parameters.disagreement_mps
+        state = replace(state, repeated=(own, model))
+    if not is_wrong or state.velocity_wrong_ns is not None:
         return state
     return replace(state, velocity_wrong_ns=at_ns)
 
