@@ -16,7 +16,9 @@ MAX_LOOKS = 4
 # Bytes that a byte may unpack to, on average over the file. LZ4 packs no closer than that whatever it is given; flights
 # of ours come to 4.
 MAX_RATIO = 255
-FREE_BYTES = 2**25  # a file may unpack to, however short it is: a policy library has some ten million bytes
+# Bytes that a file may unpack to, however short it is: pictures that stand still pack to a ten-thousandth, and ten
+# minutes of 30 a second are as much. A computer passes over them in some seconds.
+FREE_BYTES = 2**34
 MAX_CHUNK_BYTES = 2**28  # of one chunk, unpacked: all of it is in memory; recorders begin a new one at a few million
 # Bytes of a file for each record in its chunks: number and time of a message change, so that it packs to no less.
 MIN_RECORD_BYTES = 2
@@ -24,8 +26,7 @@ FREE_RECORDS = 2**16
 # Bytes that may be kept in memory for a byte of the file. A frame changes in number and checksum: with its place in
 # memory it packs to a thirtieth if it has the greatest length and its values stand still; twice that to be safe.
 MAX_KEPT_RATIO = 64
-
-
+FREE_KEPT_BYTES = 2**25  # may be kept, however short the file is: definitions of topics pack well, too
 # Of a file that is read as a whole. A fast link brings a megabyte a second, which makes 3.6 GB in an hour.
 MAX_WHOLE_BYTES = 2**32
 
@@ -42,9 +43,10 @@ class ReadBudget:
     """
 
     def __init__(self, file_bytes: int) -> None:
+        self.offset = 0  # of the record that is being read, for an error
         self._looks_left_bytes = MAX_LOOKS * file_bytes
         self._unpacked_left_bytes = FREE_BYTES + MAX_RATIO * file_bytes
-        self._kept_left_bytes = FREE_BYTES + MAX_KEPT_RATIO * file_bytes
+        self._kept_left_bytes = FREE_KEPT_BYTES + MAX_KEPT_RATIO * file_bytes
         self._records_left = FREE_RECORDS + file_bytes // MIN_RECORD_BYTES
 
     def look(self, length: int) -> None:
@@ -86,25 +88,23 @@ class ReadBudget:
             ExcessError: They are too many.
         """
         if length > self._kept_left_bytes:
-            raise ExcessError(
-                f"makes its messages more than {MAX_KEPT_RATIO} times as long as the file, as no MAVLink does"
-            )
+            raise ExcessError(f"makes what is read into memory more than {MAX_KEPT_RATIO} times as long as the file")
         self._kept_left_bytes -= length
 
 
-def read_whole(path: Path) -> bytearray:
+def read_whole(path: Path, max_bytes: int = MAX_WHOLE_BYTES) -> bytearray:
     """Return the bytes of a file.
 
     Raises:
-        RecordingError: It cannot be read, is no file (a device may have no end), or is too long.
+        RecordingError: It cannot be read, is no file (a pipe would be waited for, a device has no end), or is too long.
     """
     try:
+        size = path.stat().st_size
+        if not path.is_file() and not path.is_dir():
+            raise RecordingError(f"{path}: is a pipe or a device; give a file")
+        if size > max_bytes:
+            raise RecordingError(f"{path}: has {size} bytes, more than {max_bytes}; give a shorter one, or a part")
         with path.open("rb") as file:
-            size = path.stat().st_size
-            if not path.is_file():
-                raise RecordingError(f"{path}: is a pipe or a device; give a file")
-            if size > MAX_WHOLE_BYTES:
-                raise RecordingError(f"{path}: has {size} bytes, more than {MAX_WHOLE_BYTES}; cut it into parts")
             data = bytearray(size)
             return data[: file.readinto(data)]
     except OSError as error:

@@ -68,9 +68,11 @@ _BORDER = re.compile(r"^=+\s*$", re.MULTILINE)
 _HEAD_BYTES = 4  # of CDR
 _ORDERS = {0: ">", 1: "<", 6: ">", 7: "<"}  # second byte of CDR: XCDR1 and XCDR2, plain
 _ALIGNED_MOST = {0: 8, 1: 8, 6: 4, 7: 4}
-# Of reading a message, at most: a value has a byte at least; alone in a type, in a list, it is reached in three steps.
-_MAX_STEPS_PER_BYTE, _FREE_STEPS = 4, 64
+# Of a message that wraps a frame, at most: a frame has 280 bytes, mavros_msgs/Mavlink 16 fields.
+_MAX_WRAPPED_BYTES, _MAX_STEPS = 4096, 256
 _MAX_DEPTH = 64  # of types within types
+_MAX_DEFINITION_BYTES = 2**16  # of such a message; that of mavros_msgs/Mavlink has 3000
+_FIELD_RATIO = 64  # bytes of memory for each byte of a definition that was parsed
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _SIGNATURE_BYTES = 13
@@ -86,15 +88,14 @@ class _RosField(NamedTuple):
 
 
 Definitions = dict[str, list[_RosField]]
+Unwrapper = Callable[[bytes], bytes]  # the frame in a message
 
 
 class UnreadableError(Exception):
     """A message or its definition is not as it should be; says why."""
 
 
-def make_unwrapper(
-    encoding: str, schema_encoding: str, name: str, definition: bytes
-) -> Callable[[bytes], bytes] | None:
+def make_unwrapper(encoding: str, schema_encoding: str, name: str, definition: bytes) -> Unwrapper | None:
     """Return a function that makes a frame of each message of a channel, if they are MAVLink wrapped by ROS.
 
     Such messages are known by their fields, those of mavros_msgs/Mavlink, wherever they stand in the definition.
@@ -102,7 +103,9 @@ def make_unwrapper(
     Returns:
         None if they are something else. The function raises `UnreadableError` for a message that is damaged.
     """
-    if _DEFINITIONS.get(encoding) != schema_encoding:
+    if _DEFINITIONS.get(encoding) != schema_encoding or len(definition) > _MAX_DEFINITION_BYTES:
+        return None
+    if not all(field.encode() in definition for field in _NEEDED):
         return None
     top = _normalise_type_name(name)
     try:
@@ -157,15 +160,17 @@ def _parse_field(line: str, owner: str) -> _RosField | None:
 class _RosReader:
     """Reader of one serialised ROS message.
 
-    A definition may nest types that have no bytes, or lists of them: the steps of reading are bounded by the bytes.
+    A definition may nest types that have no bytes, or lists of them: the steps of reading are bounded.
     """
 
     def __init__(self, data: bytes, types: Mapping[str, list[_RosField]], encoding: str) -> None:
         self._types, self._cdr = types, encoding == ROS2
         self._order, self._aligned_most = "<", 1
         self._at, self._data = 0, data
-        self._steps_left = _FREE_STEPS + _MAX_STEPS_PER_BYTE * len(data)
+        self._steps_left = _MAX_STEPS
         self._depth = 0
+        if len(data) > _MAX_WRAPPED_BYTES:
+            raise UnreadableError(f"it has {len(data)} bytes, which is far more than a frame has")
         if self._cdr:
             if len(data) < _HEAD_BYTES or data[0] or data[1] not in _ORDERS:
                 raise UnreadableError("its first bytes are not those of CDR")
@@ -197,7 +202,7 @@ class _RosReader:
 
     def _take_step(self) -> None:
         if self._steps_left <= 0:
-            raise UnreadableError("it has far more fields, by its definition, than bytes")
+            raise UnreadableError(f"it has more values, by its definition, than the {_MAX_STEPS} that are read")
         self._steps_left -= 1
 
     def _read_value(self, kind: str) -> Value:
@@ -343,7 +348,7 @@ class _ChannelStream:
         self,
         channel: Channel,
         schema: Schema | None,
-        unwrap: Callable[[bytes], bytes] | None,
+        unwrap: Unwrapper | None,
         *,
         is_requested: bool,
         budget: ReadBudget,
@@ -498,9 +503,13 @@ class _TornError(Exception):
 
 
 def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
-    """Take the messages of some topics, or of all if none is given; return whether the file is torn."""
+    """Take the messages of some topics, or of all if none is given; return whether the file is torn.
+
+    Raises:
+        ExcessError: A record asks for more than the budget has; names its offset.
+    """
     schemas: dict[int, Schema] = {}
-    unwrappers: dict[tuple[int, str], Callable[[bytes], bytes] | None] = {}  # by schema and encoding of messages
+    unwrappers: dict[int, dict[str, Unwrapper | None]] = {}  # by schema, and encoding of messages
     budget = ReadBudget(size)
     try:
         for record in _iterate_records(file, size, budget):
@@ -510,18 +519,23 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
                     stream.take(record.at_ns, record.data)
             elif isinstance(record, Schema):
                 if schemas.get(record.id) != record:
-                    unwrappers = {key: unwrap for key, unwrap in unwrappers.items() if key[0] != record.id}
-                schemas[record.id] = record
+                    budget.keep(len(record.name) + len(record.data))
+                    schemas[record.id], unwrappers[record.id] = record, {}
             elif record.id not in streams:
+                budget.keep(_PIECE_BYTES + len(record.topic) + len(record.message_encoding))
                 schema, encoding = schemas.get(record.schema_id), record.message_encoding
-                key = (record.schema_id, encoding)
-                if schema is not None and key not in unwrappers:
-                    unwrappers[key] = make_unwrapper(encoding, schema.encoding, schema.name, schema.data)
+                of_schema = unwrappers.get(record.schema_id, {})
+                if schema is not None and encoding not in of_schema:
+                    of_schema[encoding] = make_unwrapper(encoding, schema.encoding, schema.name, schema.data)
+                    if of_schema[encoding] is not None:
+                        budget.keep(_FIELD_RATIO * len(schema.data))
                 streams[record.id] = _ChannelStream(
-                    record, schema, unwrappers.get(key), is_requested=record.topic in topics, budget=budget
+                    record, schema, of_schema.get(encoding), is_requested=record.topic in topics, budget=budget
                 )
     except _TornError:
         return True
+    except ExcessError as error:
+        raise ExcessError(f"offset {budget.offset}: a record {error}") from error
     return False
 
 
@@ -533,7 +547,7 @@ def _iterate_records(file: BinaryIO, size: int, budget: ReadBudget) -> Iterator[
 
     Raises:
         _TornError: The file ends within a record.
-        ExcessError: A record asks for more than the budget has; names its offset.
+        ExcessError: A record asks for more than the budget has.
     """
     at, checksum = len(MAGIC), zlib.crc32(MAGIC)
     if (begin := file.read(len(MAGIC))) != MAGIC:
@@ -547,21 +561,19 @@ def _iterate_records(file: BinaryIO, size: int, budget: ReadBudget) -> Iterator[
             raise McapError(f"a record at offset {at} claims {length} bytes")
         if length > size - at - _RECORD.size:
             raise _TornError
-        try:
-            if opcode in _LOADED:
-                budget.unpack(length)
-                content = file.read(length)
-                if opcode == Opcode.DATA_END:
-                    _check_data_end(content, checksum)
-                elif opcode == Opcode.CHUNK:
-                    yield from _iterate_chunk(_unpack_chunk(content, budget), budget)
-                else:
-                    yield from _parse_record(opcode, content)
-                checksum = zlib.crc32(content, zlib.crc32(head, checksum))
+        budget.offset = at
+        if opcode in _LOADED:
+            budget.unpack(length)
+            content = file.read(length)
+            if opcode == Opcode.DATA_END:
+                _check_data_end(content, checksum)
+            elif opcode == Opcode.CHUNK:
+                yield from _iterate_chunk(_unpack_chunk(content, budget), budget)
             else:
-                checksum = _pass_over(file, length, zlib.crc32(head, checksum))
-        except ExcessError as error:
-            raise ExcessError(f"offset {at}: a record {error}") from error
+                yield from _parse_record(opcode, content)
+            checksum = zlib.crc32(content, zlib.crc32(head, checksum))
+        else:
+            checksum = _pass_over(file, length, zlib.crc32(head, checksum))
         at += _RECORD.size + length
         if opcode == Opcode.FOOTER:
             if len(end := file.read(len(MAGIC))) < len(MAGIC):
@@ -619,19 +631,25 @@ def _iterate_chunk(content: bytes, budget: ReadBudget) -> Iterator[Schema | Chan
         begin, at = at + _RECORD.size, at + _RECORD.size + length
         if at > size:
             raise McapError("a record goes on beyond the end of its chunk")
-        if opcode in _LOADED:
+        if opcode == Opcode.MESSAGE:
+            yield _parse_message(content, begin, at)
+        elif opcode in _LOADED:
             yield from _parse_record(opcode, content[begin:at])
 
 
 def _parse_record(opcode: int, content: bytes) -> Iterator[Schema | Channel | _Message]:
     """Yield the record if it is a schema, channel or message."""
     if opcode == Opcode.MESSAGE:
-        channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(content)
-        yield _Message(channel_id, log_ns or publish_ns, content[_MESSAGE.size :])
+        yield _parse_message(content, 0, len(content))
     elif opcode == Opcode.SCHEMA:
         yield Schema.read(ReadDataStream(BytesIO(content)))
     elif opcode == Opcode.CHANNEL:
         yield Channel.read(ReadDataStream(BytesIO(content)))
+
+
+def _parse_message(content: bytes, begin: int, end: int) -> _Message:
+    channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(content, begin)
+    return _Message(channel_id, log_ns or publish_ns, content[begin + _MESSAGE.size : end])
 
 
 def _check_names(path: Path, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> None:

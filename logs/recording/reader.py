@@ -130,11 +130,14 @@ class Contents:
             channels[channel] = definition, zero_utc_ns
         elif opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
-            self._schemas[schema.id] = schema
+            if self._schemas.get(schema.id) != schema:
+                self._budget.keep(length)
+                self._schemas[schema.id] = schema
         return int(at + length)
 
     def _channel(self, record: bytes) -> tuple[int, Definition, int]:
         if record not in self._definitions:
+            self._budget.keep(len(record))
             channel = Channel.read(ReadDataStream(BytesIO(record)))
             schema = self._schemas.get(channel.schema_id)
             self._definitions[record] = channel.id, _definition(channel, schema), _zero_utc_ns(channel)

@@ -8,6 +8,7 @@ import struct
 import pytest
 from natnet_server import TICKS_PER_S, UPTIME_S, Body, descriptions, frame, message, server_info
 from scipy.spatial.transform import Rotation
+from work_rig import limit_calls, limit_memory
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up, convert_pose_to_frd, rotate_vector
@@ -59,6 +60,18 @@ def test_a_body_that_is_not_tracked_gives_no_sample(body: Body, reason: str) -> 
     assert sights(camera, frame(1, [OTHER, body], (4, 1), 10.0, 10.004)) == []
     assert camera.dropped == {reason: 1}
     assert sights(camera, frame(2, [OTHER, DRONE], (4, 1), 10.01, 10.014))  # and comes back
+
+
+@pytest.mark.parametrize("version", [(3, 1), (4, 1)])
+def test_a_count_is_not_believed_wherever_it_stands(version: tuple[int, int]) -> None:
+    camera = ready(version)
+    for whole in (frame(1, [OTHER, DRONE], version, 10.0, 10.004), descriptions([OTHER, DRONE], version)):
+        for at in range(4, len(whole) - 3):
+            data = whole[:at] + struct.pack("<I", 2**24) + whole[at + 4 :]
+            with limit_memory(200_000), limit_calls(5000):
+                camera.receive(data, 0)
+    assert camera.dropped[UNREADABLE] > 0
+    assert sights(ready(version), frame(2, [OTHER, DRONE], version, 10.01, 10.014))
 
 
 def test_frames_without_a_time_of_exposure_are_refused() -> None:

@@ -13,6 +13,7 @@ import pytest
 from patience import wait_until
 from qtm_server import UPTIME_US, QtmBody, QtmServer, command, frame, packet, parameters
 from scipy.spatial.transform import Rotation
+from work_rig import limit_calls
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Up
@@ -55,6 +56,20 @@ def test_it_asks_for_version_names_and_frames_in_turn() -> None:
         camera.receive(heard, 0)
         assert camera.due(0) == (command(said),)
     assert camera.ready and camera.ask_time(7) == b""
+
+
+def test_a_count_is_not_believed_wherever_it_stands() -> None:
+    whole = frame(1, 5_000_000, [TABLE, DRONE])
+    for at in range(8, len(whole) - 3):
+        camera = ready()
+        with limit_calls(5000):
+            camera.receive(whole[:at] + struct.pack("<I", 2**24) + whole[at + 4 :], 0)
+    camera = ready()
+    empty_components = struct.pack("<qII", 1, 1, 2**24) + struct.pack("<II", 0, 1) * 2
+    with limit_calls(5000):
+        camera.receive(packet(3, empty_components), 0)
+    assert camera.dropped == {UNREADABLE: 1}
+    assert sights(camera, whole)
 
 
 @pytest.mark.parametrize("size", [1, 7, 50, 10_000])

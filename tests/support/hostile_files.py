@@ -118,6 +118,26 @@ def make_many_channels(size: int) -> bytes:
     return MAGIC + head + channels
 
 
+def make_redefined(size: int) -> bytes:
+    """Half a file of topics, each with its schema, and half a file of one schema that changes again and again."""
+    topics = [schema(number, "a", "x", "") + channel(number, number, "", "ros1") for number in range(1, size // 120)]
+    changes = [schema(1, "a", "x", str(number)) for number in range(size // 60)]
+    return MAGIC + b"".join(topics + changes)
+
+
+def make_definitions(size: int, kind: str) -> bytes:
+    """Long schemas, or names of channels, which pack to nearly nothing."""
+    make = {"schema": lambda n: schema(n, "a", "x", "x" * 2**19), "channel": lambda n: channel(n, 0, "a" * 2**19, "x")}
+    packed = b"".join(chunk(make[kind](2 * n) + make[kind](2 * n + 1)) for n in range(1, 60))
+    return MAGIC + packed + record(Opcode.METADATA, bytes(size))
+
+
+def make_wrapped(field: str, rest: bytes) -> bytes:
+    """One message of MAVLink that ROS wraps, with a further field."""
+    head = schema(1, "pkg/Top", "ros1msg", MAVLINK_FIELDS + field) + channel(1, 1, "/m", "ros1")
+    return MAGIC + chunk(head + message(1, bytes(15) + rest))
+
+
 def _ulog_message(kind: str, payload: bytes) -> bytes:
     return struct.pack("<Hc", len(payload), kind.encode()) + payload
 

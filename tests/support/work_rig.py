@@ -1,13 +1,14 @@
-"""Limits of work that are counted, never timed: bytes that a checksum runs over, and calls of functions."""
+"""Limits of work that are counted, never timed: bytes that a checksum runs over, calls and lines."""
 
 from __future__ import annotations
 
 import sys
 import tracemalloc
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 from unittest.mock import patch
 
 
@@ -48,6 +49,23 @@ def limit_calls(limit: int) -> Iterator[None]:
         yield
     finally:
         sys.setprofile(former)
+
+
+def count_lines(work: Callable[[], object]) -> int:
+    """Lines of Python that run, once for each turn of a loop or comprehension."""
+    lines, former = 0, sys.gettrace()
+
+    def trace(_frame: FrameType, event: str, _argument: object) -> Any:
+        nonlocal lines
+        lines += event == "line"
+        return trace
+
+    sys.settrace(trace)
+    try:
+        work()
+    finally:
+        sys.settrace(former)
+    return lines
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from uavctl.records import Vec3
 
 ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
 _BLOCK_BYTES = 65_536
+_MAX_ANSWER_BYTES = 2**20  # a daemon's status has some thousand
 
 ctl_app = App(
     name="ctl",
@@ -121,8 +122,10 @@ def send_request(request: ControlRequest, folder: Path, vehicle: str | None) -> 
     with _connect_daemon(folder, vehicle) as connection:
         try:
             connection.sendall(msgspec.json.encode(request) + b"\n")
-            line = b""
+            line = bytearray()
             while not line.endswith(b"\n"):
+                if len(line) > _MAX_ANSWER_BYTES:
+                    raise NotReachedError("the answer does not end; is another program at this socket?")
                 data = connection.recv(_BLOCK_BYTES)
                 if not data:
                     raise NotReachedError("the daemon hung up: it is ending, or runs as another user")

@@ -46,6 +46,33 @@ NO_STAMP = "no-exposure-time"
 SILENT = "server-silent"
 
 
+_MAX_NAME_BYTES = 256  # MAX_NAMELENGTH of NatNet
+
+
+class _BoundedBuffer(natnet.PacketBuffer):
+    """Payload of which nothing is read beyond its end: the library makes room for what a count claims."""
+
+    def read_float32_array(self, count: int) -> tuple[float, ...]:
+        """Read numbers.
+
+        Raises:
+            ValueError: There are fewer.
+        """
+        if 4 * count > len(self.data) - self.pointer:
+            raise ValueError(f"{count} numbers are more than the datagram has")
+        return super().read_float32_array(count)
+
+    def read_string(self, max_length: int | None = None, static_length: bool = False) -> str:
+        """Read a text of a bounded length, of which the library copies no more.
+
+        Raises:
+            ValueError: The datagram ends before it.
+        """
+        if self.pointer >= len(self.data):
+            raise ValueError("the datagram ends before a text")
+        return super().read_string(_MAX_NAME_BYTES if max_length is None else max_length, static_length)
+
+
 class NatNet:
     """One rigid body of one server; implements `uavctl.io.camera.Camera`.
 
@@ -87,12 +114,10 @@ class NatNet:
                 return (Echo(token, self._ticks_to_ns(ticks)),)
             elif kind == DESCRIPTIONS and self._version is not None:
                 self._handle_descriptions(
-                    natnet.DataDescriptions.read_from_buffer(natnet.PacketBuffer(payload), self._version)
+                    natnet.DataDescriptions.read_from_buffer(_BoundedBuffer(payload), self._version)
                 )
             elif kind == FRAME and self._version is not None and self._is_complete:
-                return self._handle_frame(
-                    natnet.DataFrame.read_from_buffer(natnet.PacketBuffer(payload), self._version)
-                )
+                return self._handle_frame(natnet.DataFrame.read_from_buffer(_BoundedBuffer(payload), self._version))
         except _UNREADABLE:
             self.dropped[UNREADABLE] += 1
         return ()

@@ -33,6 +33,8 @@ NO_MEASUREMENT = "no-measurement"
 SILENT = "server-silent"
 
 _HEAD = struct.Struct("<II")
+_COMPONENTS, _COMPONENTS_AT = struct.Struct("<I"), 12  # their number, in a frame
+_MAX_COMPONENTS = 64  # a frame has one of each type, and there are some twenty types
 _SILENT_NS = 1_000_000_000
 _UNREADABLE = (struct.error, ValueError, IndexError, TypeError, KeyError, ElementTree.ParseError)
 _TOLERANCE = 1e-3
@@ -117,6 +119,9 @@ class Qualisys:
         elif kind == NO_DATA:
             self.dropped[NO_MEASUREMENT] += 1
         elif kind == DATA and self._body_index is not None:
+            (components,) = _COMPONENTS.unpack_from(payload, _COMPONENTS_AT)
+            if components > _MAX_COMPONENTS:  # the library counts them out, though each may have no bytes
+                return self._count_dropped(UNREADABLE)
             return self._handle_frame(QRTPacket(payload))
         return ()
 

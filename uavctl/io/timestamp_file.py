@@ -21,6 +21,7 @@ from uavctl.mavlink.signing import MAX_TIMESTAMP, SigningTimestamps
 WRITE_AHEAD = 200_000  # units of 10 µs: 2 s ahead of the newest timestamp
 RENEW_MARGIN = 100_000  # written again when less than this is left
 PERIOD_S = 0.25
+_MAX_CHARACTERS = 100  # that are read of a file; a stamp has at most fifteen digits
 LOCK_TRIES, LOCK_PAUSE_S = 40, 0.05  # to lock the file: a stamp is written in much less
 
 
@@ -39,8 +40,8 @@ def load_timestamp(path: Path) -> int:
         KeyFileError: it cannot be read, or is damaged.
     """
     try:
-        text = path.read_text(encoding="ascii")
-        stamp = int(text)
+        with path.open(encoding="ascii") as file:
+            stamp = int(file.read(_MAX_CHARACTERS))
     except FileNotFoundError:
         return 0
     except OSError as error:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from campaign_results import STEPS, cell, runs, write
 from ratios import paired_ratio
@@ -21,7 +24,14 @@ from logs.report.run_statistics import (
     step_rate,
 )
 from uavctl.errors import UavctlError, UsageError
-from uavctl.lab.campaign.results import compute_difference, read_results, summarise
+from uavctl.lab.campaign.results import (
+    CampaignRecord,
+    compute_difference,
+    read_cells,
+    read_document,
+    read_results,
+    summarise,
+)
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(1, 10), (3, 7), (50, 200), (199, 200), (2, 200_000)])
@@ -198,6 +208,74 @@ def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
     (tmp_path / "runs.parquet").write_bytes(b"torn")
     with pytest.raises(UavctlError, match="--resume"):
         summarise(tmp_path)
+
+
+def make_table(cells: Sequence[int | None], **columns: Sequence[object]) -> pa.Table:
+    errors = {"error": [""] * len(cells)}
+    return pa.Table.from_pydict({"cell": pa.array(cells, type=pa.int32()), **errors, **columns})
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        (make_table([0] * 1_200_000), "claims 1200000 runs"),
+        (make_table([0], ages=[[1] * 100_000]), "unpack to more"),
+        (make_table([0]), "lacks a column"),
+        (pa.Table.from_pydict({"cell": [0]}), "lacks a column"),
+        (make_table([1, 0]), "not in the order of the cells"),
+        (make_table([None]), "not in the order of the cells"),
+    ],
+)
+@pytest.mark.fault(96)
+def test_a_table_that_no_campaign_writes_is_refused(
+    table: pa.Table, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("uavctl.lab.campaign.results._FREE_CELL_BYTES", 2**15)
+    write(tmp_path, [cell(0, "a"), cell(1, "b")], runs(0, [1.0]))
+    pq.write_table(table, tmp_path / "runs.parquet")
+    with pytest.raises(UavctlError, match=rf"runs\.parquet: .*{words}"):
+        summarise(tmp_path)
+
+
+@pytest.mark.parametrize("text", [b'{"more":' + b"[" * 100_000, b'{"more":' + b"[" * 100_000 + b"]" * 100_000 + b"}"])
+def test_a_document_that_nests_without_end_is_refused(text: bytes, tmp_path: Path) -> None:
+    (tmp_path / "campaign.json").write_bytes(text)
+    with pytest.raises(UavctlError, match="holds no campaign"):
+        summarise(tmp_path)
+
+
+def test_cells_may_share_row_groups_or_have_several(tmp_path: Path) -> None:
+    rows = [row for index in range(3) for row in runs(index, [float(10 * index + run) for run in range(5)])]
+    cells = [cell(index, str(index)) for index in range(4)]
+    whole = read_results(write(tmp_path / "whole", cells, rows))
+    write(tmp_path / "cut", cells, rows)
+    pq.write_table(
+        pq.read_table(tmp_path / "cut" / "runs.parquet"), tmp_path / "cut" / "runs.parquet", row_group_size=2
+    )
+    cut = read_results(tmp_path / "cut")
+    for index in range(4):
+        assert cut.runs[index]["cost"].tolist() == whole.runs[index]["cost"].tolist()
+        assert cut.runs[index].index.tolist() == list(range(5 if index < 3 else 0))
+
+
+def test_the_rows_of_one_cell_are_in_memory_at_a_time(tmp_path: Path) -> None:
+    def peak_bytes(cells: int) -> int:
+        rows = [row for index in range(cells) for row in runs(index, [1.0] * 2, ages=[[1] * 20_000] * 2)]
+        folder = write(tmp_path / str(cells), [cell(index, "a") for index in range(cells)], rows)
+        table = pq.read_table(folder / "runs.parquet")
+        pq.write_table(table, folder / "runs.parquet", row_group_size=2)
+        before = pa.total_allocated_bytes()
+        sizes: list[int] = []
+        document = read_document(folder, CampaignRecord)
+        read_cells(
+            folder,
+            document.cells,
+            ("ages", "error"),
+            lambda rows, _: sizes.append(pa.total_allocated_bytes() - before + rows.num_rows),
+        )
+        return max(sizes)
+
+    assert peak_bytes(20) < 3 * peak_bytes(2)
 
 
 def test_a_ratio_of_means_has_the_interval_of_resampled_pairs() -> None:

@@ -254,6 +254,9 @@ def test_a_folder_goes_on_and_refuses_other_runs(tmp_path: Path) -> None:
     (tmp_path / "other" / "notes.txt").write_text("mine")
     with pytest.raises(UsageError, match="no run"):
         TuneFolder.open(tmp_path / "other", room(), ASKED)
+    (tmp_path / "run" / STATE_FILE).write_text('{"more":' + "[" * 100_000)
+    with pytest.raises(UsageError, match="cannot be read"):
+        TuneFolder.open(tmp_path / "run", room(), ASKED)
     (tmp_path / "run" / STATE_FILE).write_text("{")
     with pytest.raises(UsageError, match="cannot be read"):
         TuneFolder.open(tmp_path / "run", room(), ASKED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from logs.recording.budget import ExcessError, read_whole
 from logs.report.run_statistics import (
     Interval,
     PairedDifference,
@@ -24,7 +25,7 @@ from logs.report.run_statistics import (
 )
 from logs.report.statistics import replace_infinite
 from uavctl.arrays import Array
-from uavctl.errors import UavctlError
+from uavctl.errors import RecordingError, UavctlError
 
 DOCUMENT, RUNS = "campaign.json", "runs.parquet"
 
@@ -34,6 +35,7 @@ _COUNT_COLUMNS = ("saturated", "decisions", "infeasible", "slack_used", "fallbac
 _FLOAT_COLUMNS = ("cost", "settled_cost", "mean_square_input", "largest_gap")
 _FIGURE_COLUMNS = (*_FLOAT_COLUMNS, "state_violations", "input_violations", *_COUNT_COLUMNS)
 _LATER_COLUMNS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")  # tables of older versions lack them
+_RUN_COLUMNS = ("run", "error", *_FIGURE_COLUMNS, *_LATER_COLUMNS, "ages", "outside")
 
 
 class CellRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,6 +49,13 @@ class CellRecord(msgspec.Struct, frozen=True, kw_only=True):
     design_id: str | None = None
     usable_room: float | None = None  # share of it in which a plan may rest
 
+
+# Of `campaign.json`: ten thousand cells have some three million bytes.
+_MAX_DOCUMENT_BYTES = 2**26
+# Of the table: a run has its own cost, which packs to no less than two bytes, and a figure has eight in memory.
+_FREE_ROWS, _MIN_ROW_BYTES, _VALUE_BYTES = 2**20, 2, 8
+# Of memory for the rows of one cell: what may unpack to it however short the file is, and for each byte of the file.
+_FREE_CELL_BYTES, _MAX_CELL_RATIO = 2**30, 64
 
 D = TypeVar("D")
 F = TypeVar("F")
@@ -113,7 +122,9 @@ def read_results(folder: Path) -> Results:
     record = read_document(folder, CampaignRecord)
     runs = {
         cell.index: cell_runs
-        for cell, cell_runs in zip(record.cells, read_cells(folder, record.cells, _collect_runs), strict=True)
+        for cell, cell_runs in zip(
+            record.cells, read_cells(folder, record.cells, _RUN_COLUMNS, _collect_runs), strict=True
+        )
     }
     return Results(
         folder=folder,
@@ -134,30 +145,92 @@ def read_document(folder: Path, kind: type[D]) -> D:
         UavctlError: It is missing, damaged, or of another kind.
     """
     try:
-        return msgspec.json.decode((folder / DOCUMENT).read_bytes(), type=kind)
-    except (OSError, msgspec.MsgspecError) as error:
+        return msgspec.json.decode(read_whole(folder / DOCUMENT, _MAX_DOCUMENT_BYTES), type=kind)
+    except (RecordingError, msgspec.MsgspecError, RecursionError) as error:
         raise UavctlError(f"{folder} holds no campaign ({error}); give the folder of one") from error
 
 
-def read_cells(folder: Path, cells: Sequence[C], figures: Callable[[pa.Table, C], F]) -> list[F]:
-    """Return the result of `figures` for the rows of each cell in `runs.parquet`.
+def read_cells(
+    folder: Path, cells: Sequence[C], columns: Sequence[str], figures: Callable[[pa.Table, C], F]
+) -> list[F]:
+    """Return the result of `figures` for the rows of each cell in `runs.parquet`; those of one cell are in memory.
 
     Raises:
-        UavctlError: It is missing or damaged.
+        UavctlError: It is missing or damaged, or unpacks to far more than its bytes.
     """
+    path, by_index = folder / RUNS, {cell.index: cell for cell in cells}
+    found: dict[int, F] = {}
     try:
-        table = pq.read_table(folder / RUNS)
-        column = table["cell"].to_numpy()
-        ends = (np.searchsorted(column, [cell.index, cell.index + 1]) for cell in cells)
-        return [figures(table.slice(a, b - a), cell) for cell, (a, b) in zip(cells, ends, strict=True)]
-    except (OSError, pa.ArrowException, KeyError) as error:
+        with pq.ParquetFile(path, read_dictionary=["error"]) as file:
+            for index, rows in _iterate_cells(file, ("cell", *columns), path.stat().st_size):
+                if index in by_index:
+                    found[index] = figures(rows, by_index[index])
+            empty = file.schema_arrow.empty_table()
+        return [found[cell.index] if cell.index in found else figures(empty, cell) for cell in cells]
+    except ExcessError as error:
+        raise UavctlError(f"{path}: {error}, as no campaign does; fly it again, or fetch the file again") from error
+    except KeyError as error:
+        raise UavctlError(f"{path}: lacks a column ({error.args[0]!s}); give the folder of a campaign") from error
+    except (OSError, pa.ArrowException, ValueError, TypeError, MemoryError) as error:
         raise UavctlError(
-            f"{folder / RUNS}: cannot be read ({error}); if the campaign was interrupted, go on with --resume"
+            f"{path}: cannot be read ({error}); if the campaign was interrupted, go on with --resume"
         ) from error
 
 
+def _iterate_cells(file: pq.ParquetFile, columns: Sequence[str], file_bytes: int) -> Iterator[tuple[int, pa.Table]]:
+    """Yield each cell's index and rows, in the order of the file.
+
+    Raises:
+        ValueError: It is not in the order of its cells.
+        ExcessError: It holds far more than its bytes.
+    """
+    max_rows = _FREE_ROWS + file_bytes // _MIN_ROW_BYTES
+    if file.metadata.num_rows > max_rows:
+        raise ExcessError(f"claims {file.metadata.num_rows} runs in {file_bytes} bytes")
+    left_bytes = _FREE_CELL_BYTES + _MAX_CELL_RATIO * file_bytes
+    last, kept_bytes = -1, 0
+    parts: list[pa.Table] = []
+    for group in range(file.num_row_groups):
+        kept_bytes += _count_memory(file.metadata.row_group(group), columns)
+        if kept_bytes > left_bytes:
+            raise ExcessError(f"row group {group} makes one cell unpack to more than {left_bytes} bytes")
+        rows = file.read_row_group(group, columns=list(columns))
+        cells = rows["cell"].to_numpy()
+        if rows.num_rows and not (cells[0] >= last and bool((np.diff(cells) >= 0).all())):
+            raise ValueError(f"row group {group} is not in the order of the cells")
+        starts = np.searchsorted(cells, np.unique(cells))
+        for begin, end in zip(starts, (*starts[1:], rows.num_rows), strict=True):
+            index = int(cells[begin])
+            if index != last and last >= 0:
+                yield last, pa.concat_tables(parts)
+            if index != last:
+                last, parts, kept_bytes = index, [], _count_memory(file.metadata.row_group(group), columns)
+            parts.append(rows.slice(begin, end - begin))
+    if last >= 0:
+        yield last, pa.concat_tables(parts)
+
+
+def _count_memory(group: pq.RowGroupMetaData, columns: Sequence[str]) -> int:
+    """Return the bytes that some columns of a row group unpack to, by its own words."""
+    chunks = [group.column(index) for index in range(group.num_columns)]
+    return sum(
+        _VALUE_BYTES * chunk.num_values + chunk.total_uncompressed_size
+        for chunk in chunks
+        if chunk.path_in_schema.partition(".")[0] in columns
+    )
+
+
+def read_texts(column: pa.ChunkedArray) -> list[str]:
+    """Return the texts of a column, of which equal ones are one in memory."""
+    texts: list[str] = []
+    for chunk in column.dictionary_encode().chunks:
+        names = chunk.dictionary.to_pylist()
+        texts += ["" if code is None else names[code] for code in chunk.indices.to_pylist()]
+    return texts
+
+
 def _collect_runs(rows: pa.Table, cell: CellFigures) -> CampaignRuns:  # noqa: ARG001 all are alike
-    errors = rows["error"].to_pylist()
+    errors = read_texts(rows["error"])
     run_numbers = rows["run"].to_numpy()
     is_complete = np.array([not error for error in errors], dtype=np.bool_) & np.isfinite(rows["cost"].to_numpy())
     failed = tuple(

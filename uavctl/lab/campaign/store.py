@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from logs.recording.replay import unequal
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.pool import Columns, Work
+from uavctl.lab.campaign.results import DOCUMENT, RUNS, read_document
 
-DOCUMENT, SPECIFICATION, RUNS, PARTS = "campaign.json", "campaign.toml", "runs.parquet", "parts"
+SPECIFICATION, PARTS = "campaign.toml", "parts"
 _GROUP_ROWS = 65_536
 # Columns that name the cell of each row, in either world, so that the table can be read alone.
 CELL_COLUMNS = ("scenario", "autopilot", "rate_hz", "controller", "link", "air", "disturbance", "plant")
@@ -138,7 +139,7 @@ class Store:
         with self._convert_disk_errors():
             if not self.is_complete():
                 draft = path.with_suffix(".draft")
-                cell_records = msgspec.json.decode((self.folder / DOCUMENT).read_bytes())["cells"]
+                cell_records = read_document(self.folder, dict[str, Any])["cells"]
                 cells = {record["index"]: record for record in cell_records}
                 types = {
                     name: _F64 if name == "rate_hz" else pa.string()
@@ -175,6 +176,9 @@ class Store:
 
     def _read_part(self, task: Work) -> pa.Table:
         try:
+            rows = pq.read_metadata(self._get_part_path(task)).num_rows
+            if rows != task.runs:
+                raise pa.ArrowInvalid(f"{rows} runs instead of {task.runs}")
             return pq.read_table(self._get_part_path(task), schema=self._schema)
         except (pa.ArrowException, OSError) as error:
             raise UavctlError(
@@ -185,7 +189,7 @@ class Store:
         self.check(resume)
         path = self.folder / DOCUMENT
         if resume:
-            stored = msgspec.json.decode(path.read_bytes())
+            stored = read_document(self.folder, dict[str, Any])
             current = msgspec.json.decode(msgspec.json.encode(document))
             difference = find_first_difference(stored, current)
             if difference is not None:

@@ -23,7 +23,7 @@ from uavctl.config.document import MAX_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
 from uavctl.errors import RAISED, ConfigError, DesignError, in_words
 from uavctl.lab.campaign.pool import Columns, Work
-from uavctl.lab.campaign.results import CellRecord, read_cells, read_document
+from uavctl.lab.campaign.results import CellRecord, read_cells, read_document, read_texts
 from uavctl.lab.campaign.spec import (
     CONFIGURATION,
     MAX_CELLS,
@@ -381,11 +381,11 @@ def summarise_trial(folder: Path) -> tuple[TrialRecord, list[TrialSummary]]:
         UavctlError: The folder has no results that can be read.
     """
     record = read_document(folder, TrialRecord)
-    return record, read_cells(folder, record.cells, _summarise_cell)
+    return record, read_cells(folder, record.cells, ("error", "mode", *FLOAT_COLUMNS), _summarise_cell)
 
 
 def _summarise_cell(rows: pa.Table, place: TrialCellRecord) -> TrialSummary:
-    errors = rows["error"].to_pylist()
+    errors = read_texts(rows["error"])
     finished = [i for i, error in enumerate(errors) if not error]
     columns = {name: rows[name].to_pylist() for name in (*FLOAT_COLUMNS, "mode")}
     values = {name: [float(columns[name][i]) for i in finished] for name in FLOAT_COLUMNS}

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from logs.recording.budget import read_whole
 from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
 from logs.recording.summary import compute_position_errors_m
@@ -27,8 +28,9 @@ from logs.report.plots import DASHED, DOTTED
 from logs.report.svg import Drawing, colour, open_canvas
 from uavctl.arrays import Array
 from uavctl.config import Config
+from uavctl.config.document import DataFileError, read_text
 from uavctl.config.load import dump_config, flatten_keys, parse
-from uavctl.errors import UsageError
+from uavctl.errors import RecordingError, UsageError
 from uavctl.lab.trial import compute_excess_m, compute_rms_m
 from uavctl.lab.tune.change import Change, PredictionErrors, TunedResult
 from uavctl.lab.tune.excitation import SETTLING_S, SafeBox
@@ -38,6 +40,7 @@ from uavctl.smpc.plant import AXES
 PLANNED_AHEAD_S = 0.5  # time ahead at which a plan is compared with the flight
 MIN_HOLD_S = 2.0
 _SAME_M = 1e-6
+_MAX_PROGRESS_BYTES = 2**26  # of `tune`'s own file, which has some ten thousand
 
 
 class TunedFlight(msgspec.Struct, frozen=True, kw_only=True):
@@ -290,7 +293,10 @@ def read_tuned(path: Path) -> Config:
         UsageError: A key is missing: its value would be a preset's, which no flight has tested.
         ConfigError: It is wrong.
     """
-    text = path.read_text(encoding="utf-8")
+    try:
+        text = read_text(path)
+    except DataFileError as error:
+        raise UsageError(f"{error}; mend the file or remove it: the same command then writes it anew") from error
     config = parse(text, str(path)).config
     keys = dict(flatten_keys(tomllib.loads(text)))
     missing = [key for key, _ in flatten_keys(tomllib.loads(dump_config(config))) if key not in keys]
@@ -305,16 +311,16 @@ def read_tuned(path: Path) -> Config:
 
 def _read_progress(path: Path) -> TuneProgress:
     try:
-        return msgspec.json.decode(path.read_bytes(), type=TuneProgress)
-    except (OSError, msgspec.DecodeError) as error:
+        return msgspec.json.decode(read_whole(path, _MAX_PROGRESS_BYTES), type=TuneProgress)
+    except (RecordingError, msgspec.DecodeError, RecursionError) as error:
         raise UsageError(f"{path}: cannot be read ({error}); choose another --folder") from error
 
 
 def _describe_differences(settings: Path, text: str) -> Iterator[str]:
     """Return the first keys in which two configurations differ, with both values."""
     try:
-        old = dict(flatten_keys(tomllib.loads(settings.read_text(encoding="utf-8"))))
-    except (OSError, tomllib.TOMLDecodeError):
+        old = dict(flatten_keys(tomllib.loads(read_text(settings))))
+    except (DataFileError, tomllib.TOMLDecodeError):
         return
     new = dict(flatten_keys(tomllib.loads(text)))
     keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]

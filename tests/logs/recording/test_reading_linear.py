@@ -1,0 +1,87 @@
+"""Ten times the honest file takes at most twelve times the lines of Python, for each reader; counted, not timed."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import hostile_files as files
+import pytest
+from foreign_rig import TLOGS, rows_of, write
+from ulog_writer import UlogWriter
+from work_rig import count_lines
+
+from logs.recording.foreign import read_mcap
+from logs.recording.reader import scan
+from logs.recording.tlog import read_tlog
+from logs.recording.ulog import read_ulog
+from uavctl.config.document import find_excess, find_key_lines, read_text
+from uavctl.config.mission import MissionConfig, TrajectoryConfig, read_trajectory_file
+
+FRAME = rows_of(TLOGS[0])[0][3]
+BEGIN_US = 1_700_000_000_000_000
+
+
+def make_tlog(path: Path, size: int) -> None:
+    path.write_bytes(b"".join(struct.pack(">Q", BEGIN_US + 10_000 * number) + FRAME for number in range(size)))
+
+
+def make_ulog(path: Path, size: int) -> None:
+    log = UlogWriter(1)
+    topics = [log.topic(f"topic{number}", ["float x"]) for number in range(size // 10)]
+    for number in range(size):
+        log.data(topics[number % len(topics)], 10_000 * number + 1, 1.0)
+    path.write_bytes(log.file)
+
+
+def make_frames(path: Path, size: int) -> None:
+    write(path, [("/mavlink", "mavlink", 10**18 + 10**7 * number, FRAME) for number in range(size)])
+
+
+def make_topics(path: Path, size: int) -> None:
+    topics = (files.schema(n, "a", "x", "") + files.channel(n, n, f"/t{n}", "ros1") for n in range(2, size))
+    path.write_bytes(
+        files.MAGIC + files.channel(1, 0, "/mavlink", "") + files.message(1, FRAME, 10**18) + b"".join(topics)
+    )
+
+
+def make_toml(path: Path, size: int) -> None:
+    path.write_text("".join(f"[table{number}]\nkey = [1, 2, 3]\n" for number in range(size)))
+
+
+def make_trajectory(path: Path, size: int) -> None:
+    path.write_text("".join(f"{0.1 * number:.3f}, 1.0, 2.0, -1.5\n" for number in range(size)))
+
+
+def read_toml(path: Path) -> None:
+    text = read_text(path)
+    assert find_excess(text) is None
+    assert find_key_lines(text)
+
+
+def read_trajectory(path: Path) -> None:
+    mission = MissionConfig(trajectory=TrajectoryConfig(file=path.name))
+    read, _ = read_trajectory_file(mission, path.parent, [])
+    assert read.trajectory.times_s
+
+
+READERS: dict[str, tuple[Callable[[Path, int], None], Callable[[Path], object]]] = {
+    "tlog": (make_tlog, read_tlog),
+    "ULog": (make_ulog, read_ulog),
+    "MCAP, many frames": (make_frames, read_mcap),
+    "MCAP, many topics": (make_topics, read_mcap),
+    "MCAP, chunks": (make_frames, lambda path: list(scan(path))),
+    "TOML": (make_toml, read_toml),
+    "CSV": (make_trajectory, read_trajectory),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_ten_times_the_file_takes_at_most_twelve_times_the_work(name: str, tmp_path: Path) -> None:
+    make, read = READERS[name]
+    short, long = tmp_path / "short", tmp_path / "long"
+    make(short, 300)
+    make(long, 3000)
+    read(short)  # what is done once for all files
+    assert count_lines(lambda: read(long)) <= 12 * count_lines(lambda: read(short))
