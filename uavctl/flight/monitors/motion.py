@@ -214,4 +214,4 @@ def find_distance(path: tuple[tuple[int, Vector], ...], at_ns: int) -> Vector | 
     (begin_ns, begin), (end_ns, end) = path[after - 1 : after + 1]
     # s = s_0 + (t - t_0) / (t_1 - t_0) (s_1 - s_0)
     part = (at_ns - begin_ns) / (end_ns - begin_ns)
-    return tuple(a + part * (b - a) for a, b in zip(begin, end, strict=True))
+    return tuple([a + part * (b - a) for a, b in zip(begin, end, strict=True)])
