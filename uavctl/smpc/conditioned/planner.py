@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
+import msgspec
 import numpy as np
 
 from uavctl.arrays import Array
@@ -66,8 +67,7 @@ MAX_ROUNDS = (
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
-@dataclass(frozen=True, eq=False)
-class _RowBackoffs:
+class _RowBackoffs(msgspec.Struct, frozen=True, eq=False):
     """Back-offs of the rows in each stage, for a covariance and an age."""
 
     sigma: Array  # standard deviations (H, m)
@@ -88,8 +88,7 @@ class _Allocation:
     reference_backoffs: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _PlanResult:
+class _PlanResult(msgspec.Struct, frozen=True, eq=False):
     """A plan: z of each program that was solved, the back-offs (H, m), the margin (H, m) and the iterations."""
 
     z_of_program: Sequence[tuple[PartProgram, Array]]
@@ -231,7 +230,7 @@ class ConditionedSolver:
         dx = x - reference
         lower, upper, tightening = self._find_input_bounds(preview)
         margin_x, hard = self._regulated.compute_margin(
-            dx, limits - self._c @ reference, equilibrium_input, first, tightening
+            dx, limits - self._c.dot(reference), equilibrium_input, first, tightening
         )
         path_z: list[tuple[PartProgram, Array]] = []
         if preview.path is not None:
@@ -400,7 +399,7 @@ class ConditionedSolver:
         problem = self.problem
         if preview.path is None:
             # x_0'P x_0 + |z|²
-            cost = dx[0] @ self._tail @ dx[0] + sum([z.dot(z) for _, z in result.z_of_program])
+            cost = dx[0].dot(self._tail).dot(dx[0]) + sum([z.dot(z) for _, z in result.z_of_program])
         else:
             # Σ_t (x_t - p_t)'Q_x(x_t - p_t) + (u_t - r_t)'Q_u(u_t - r_t) + x_H'P x_H
             last, dx, du = dx[-1], dx[:-1] - preview.path.states, du - preview.path.inputs
