@@ -379,11 +379,16 @@ def update_with_inertial(kalman: Kalman, belief: Belief, accel_mps2: Array, u: A
     )
 
 
+def compute_position_variance(parameters: EstimatorParameters, sample: PositionSample) -> float:
+    """Compute the variance of a sample's position, each axis [m²]."""
+    return max(sample.std_m, parameters.position_std_m) ** 2
+
+
 def read_measurement(kalman: Kalman, sample: PositionSample) -> tuple[Array, Array]:
     """Return the values of a sample (positions, then velocities if it has them) and their variances."""
     parameters, axes = kalman.parameters, kalman.axes
     values = _select_axes(sample.position_m, axes)
-    variances = [max(sample.std_m, parameters.position_std_m) ** 2] * len(axes)
+    variances = [compute_position_variance(parameters, sample)] * len(axes)
     if sample.velocity_mps is not None:
         values += _select_axes(sample.velocity_mps, axes)
         variances += [parameters.velocity_std_mps**2] * len(axes)

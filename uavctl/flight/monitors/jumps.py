@@ -94,9 +94,11 @@ def _is_jump(track: JumpTrack, offset_m: Vec3, spread_m: Array, age_s: float) ->
     error_m = min(ERROR_MPS * age_s + 0.5 * ERROR_MPS2 * age_s * age_s, LARGEST_ERROR_M)
     bound_m = max(LEAST_JUMP_M, JUMP_SIGMA * float(spread_m.max()), error_m)
     change = [now - before for now, before in zip(offset_m, track.offset_m, strict=True)]
+    if not min(math.hypot(*offset_m), math.hypot(*change)) > bound_m:
+        return False
     # ν_0' Δν > c |Δν|²
     grows = sum(b * c for b, c in zip(track.offset_m, change, strict=True)) > GROWN_PART * sum(c * c for c in change)
-    return min(math.hypot(*offset_m), math.hypot(*change)) > bound_m and not grows
+    return not grows
 
 
 def _confirm_jump(track: JumpTrack, offset_m: Vec3, jump_m: Vec3, at_ns: int) -> JumpTrack:

@@ -113,7 +113,7 @@ def _extend_vehicle_path(motion: Motion, observation: Observation) -> tuple[tupl
     last_ns, distance = path[-1]
     # s = s + Δt v
     s = (at_ns - last_ns) * 1e-9
-    distance = tuple(flown + s * v for flown, v in zip(distance, velocity, strict=True))
+    distance = tuple([flown + s * v for flown, v in zip(distance, velocity, strict=True)])
     kept = path[bisect_right(path, at_ns - KEPT_NS, key=_TIME) :]
     return (*kept, (at_ns, distance))
 
