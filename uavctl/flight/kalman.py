@@ -211,7 +211,8 @@ def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_
         mean += g.dot(acting)
         # P = ½ F P F' + (½ F P F')'
         half = f.dot(cov).dot(half_transposed)
-        cov = half + half.T
+        cov = half.T.copy()
+        cov += half
         if stop_ns == boundary_ns:
             _draw_disturbance(kalman, mean, cov, _uses_inertial(belief.inertial, stop_ns))
             if u is None and kalman.n_bias:
@@ -312,7 +313,7 @@ def is_consistent(kalman: Kalman, belief: Belief, values: Array, variances: Arra
     index = kalman.measured_index[: len(values)]
     innovation = values - belief.mean[index]
     # ν' S⁻¹ ν ≤ ν' ν / min R: where even that is well within, nothing has to be solved.
-    if float(innovation.dot(innovation)) <= 0.9 * inertial.MOST_CHI2 * float(variances.min()):
+    if float(innovation.dot(innovation)) <= 0.9 * inertial.MOST_CHI2 * min(variances.tolist()):
         return True
     noise = kalman.identity[: len(values), : len(values)] * variances
     # χ² = ν' (H P H' + R)⁻¹ ν

@@ -92,7 +92,7 @@ def _is_jump(track: JumpTrack, offset_m: Vec3, spread_m: Array, age_s: float) ->
     """Whether a position is far from its prediction, and the last one that counted was not on the way there."""
     # e = min(v t + ½ a t², e_max)
     error_m = min(ERROR_MPS * age_s + 0.5 * ERROR_MPS2 * age_s * age_s, LARGEST_ERROR_M)
-    bound_m = max(LEAST_JUMP_M, JUMP_SIGMA * float(spread_m.max()), error_m)
+    bound_m = max(LEAST_JUMP_M, JUMP_SIGMA * max(spread_m.tolist()), error_m)
     change = [now - before for now, before in zip(offset_m, track.offset_m, strict=True)]
     if not min(math.hypot(*offset_m), math.hypot(*change)) > bound_m:
         return False
