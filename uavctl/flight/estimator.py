@@ -176,7 +176,7 @@ def update_inertial(kalman: Kalman, history: FilterHistory, samples: Sequence[In
     readings = [one for one, before in zip(samples, (None, *samples), strict=False) if _is_new_reading(one, before)]
     if not readings or not kalman.n_inertial:
         return history
-    at_ns = sum(one.at_ns for one in readings) // len(readings)
+    at_ns = sum([one.at_ns for one in readings]) // len(readings)
     if at_ns <= history.window_begin_ns:
         return history
     mean = average_vectors([one.accel_mps2 for one in readings])

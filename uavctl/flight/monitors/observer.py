@@ -112,7 +112,8 @@ def predict_observer(
     s = (at_ns - observer.at_ns) * 1e-9
     # P = F P F' + q² Q, with white jerk of density q
     f = np.array([[1.0, s, 0.5 * s * s], [0.0, 1.0, s], [0.0, 0.0, 1.0]])
-    q = np.array([[s**5 / 20, s**4 / 8, s**3 / 6], [s**4 / 8, s**3 / 3, s**2 / 2], [s**3 / 6, s**2 / 2, s]])
+    q_pv, q_pd, q_vd = s**4 / 8, s**3 / 6, s**2 / 2
+    q = np.array([[s**5 / 20, q_pv, q_pd], [q_pv, s**3 / 3, q_vd], [q_pd, q_vd, s]])
     cov = f.dot(observer.cov).dot(f.T) + wander_mps2**2 * q
     inertial = observer.inertial
     if path:

@@ -134,7 +134,7 @@ def _find_drift(
     Args:
         velocity: The vehicle's own mean velocity over the window (3,) [m/s].
     """
-    at_ns = sum([one[0] - offsets[0][0] for one in offsets]) // len(offsets) + offsets[0][0]
+    at_ns = sum([captured_ns for captured_ns, _ in offsets]) // len(offsets)
     # ō = Σ o_i / n
     mean: Array = np.add.reduce(points, axis=0) / len(offsets)
     place: list[float] = mean.tolist()
