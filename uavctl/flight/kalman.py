@@ -303,8 +303,11 @@ def _correct_covariance(kalman: Kalman, cov: Array, gain: Array, of_z: Array, no
     # I - K H
     keep = kalman.identity - gain.dot(of_z)
     # P = (I - K H) P (I - K H)' + K R K', made symmetric; a copy of the transpose makes the product faster
-    half = 0.5 * (keep.dot(cov).dot(keep.T.copy()) + gain.dot(noise).dot(gain.T))
-    corrected: Array = half + half.T
+    half = keep.dot(cov).dot(keep.T.copy())
+    half += gain.dot(noise).dot(gain.T)
+    half *= 0.5
+    corrected: Array = half.T.copy()
+    corrected += half
     return corrected
 
 

@@ -295,10 +295,15 @@ def _judge_sample(
     width = outliers.compute_gate(reach, kalman, belief, variances, error_mps)
     outlier_track, verdict = outliers.update(sources.outliers, OutlierObservation(at_ns, offset, width, n_axes))
     if verdict.is_none:
+        later_error_mps = sources.velocity_error_mps
         if at_ns > (history.captured_ns or at_ns):
-            error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
-            sources = replace(sources, velocity_error_mps=error_mps)
-        sources = replace(sources, outliers=outlier_track, noise=noise.update(sources.noise, sample, at_ns))
+            later_error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
+        sources = replace(
+            sources,
+            velocity_error_mps=later_error_mps,
+            outliers=outlier_track,
+            noise=noise.update(sources.noise, sample, at_ns),
+        )
         if not sources.noise.is_known:
             return sources, NO_VERDICT
         return _judge_jump(kalman, sources, offset, _prepare_sample(sources, sample, at_ns), belief)
