@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 
@@ -160,7 +160,7 @@ def insert_sample(
     if _is_duplicate(history.entries, key):
         return history, EventCode.SAMPLE_DUPLICATE
     new = FilterEvent(key=key, sample=sample)
-    place = bisect_right(history.entries, key, key=_KEY)
+    place = _find_place(history.entries, key)
     inserted, later = _insert(history, new), history.entries[place:]
     if belief is not None and len(history.states) >= place and not (later and later[0].key[0] == key[0]):
         # The prediction is this one, and not that of a later entry of the same instant.
@@ -176,7 +176,7 @@ def update_inertial(kalman: Kalman, history: FilterHistory, samples: Sequence[In
     readings = [one for one, before in zip(samples, (None, *samples), strict=False) if _is_new_reading(one, before)]
     if not readings or not kalman.n_inertial:
         return history
-    at_ns = sum(one.at_ns for one in readings) // len(readings)
+    at_ns = sum([one.at_ns for one in readings]) // len(readings)
     if at_ns <= history.window_begin_ns:
         return history
     mean = average_vectors([one.accel_mps2 for one in readings])
@@ -196,7 +196,7 @@ def average_vectors(vectors: Sequence[Vec3]) -> Vec3:
     """Return the mean of vectors, at least one."""
     n = len(vectors)
     # ā = Σ a_i / n
-    north, east, down = (sum(values) / n for values in zip(*vectors, strict=True))
+    north, east, down = [sum(values) / n for values in zip(*vectors, strict=True)]
     return north, east, down
 
 
@@ -207,11 +207,10 @@ def _is_new_reading(sample: InertialSample, before: InertialSample | None) -> bo
 
 def _is_duplicate(entries: Sequence[FilterEvent], key: Key) -> bool:
     """Whether a source has sent a sample with this stamp. Stamps lie near the capture times that count."""
-    first = bisect_left(entries, key[3] - LATEST_STAMP_NS, key=lambda entry: entry.key[0])
-    for entry in entries[first:]:
-        if entry.key[0] > key[3]:
+    for entry in reversed(entries):
+        if entry.key[0] < key[3] - LATEST_STAMP_NS:
             return False
-        if entry.key[2:] == key[2:]:
+        if entry.key[0] <= key[3] and entry.key[2:] == key[2:]:
             return True
     return False
 
@@ -235,7 +234,7 @@ def note_input(history: FilterHistory, at_ns: int, u: Array | None, belief: Beli
     if before is u or (before is not None and u is not None and before.tolist() == u.tolist()):
         return history
     new = FilterEvent(key=(at_ns, _INPUT, "", at_ns), input=u)
-    place = bisect_right(history.entries, new.key, key=_KEY)
+    place = _find_place(history.entries, new.key)
     inserted = _insert(history, new)
     if belief is not None and len(history.states) >= place:
         inserted.states.append(FilterState(belief=belief, input=u))
@@ -358,10 +357,14 @@ def _compute_state(kalman: Kalman, history: FilterHistory, count: int) -> Filter
     return states[count - 1] if count else history.anchor
 
 
+def _find_place(entries: Sequence[FilterEvent], key: Key) -> int:
+    """Find the place of a key in a sorted history; most belong at its end."""
+    return len(entries) if not entries or entries[-1].key <= key else bisect_right(entries, key, key=_KEY)
+
+
 def _insert(history: FilterHistory, new: FilterEvent) -> FilterHistory:
     """Sort an entry in; the states from there on are not known any more."""
-    entries = history.entries
-    place = bisect_right(entries, new.key, key=_KEY)
+    entries, place = history.entries, _find_place(history.entries, new.key)
     return FilterHistory(
         origin_ns=history.origin_ns,
         window_begin_ns=history.window_begin_ns,

@@ -163,11 +163,12 @@ def _count_link(
 
 def _find_link_alarms(link: LinkEstimate, reported: tuple[str, ...]) -> tuple[str, ...]:
     """Find the link alarms that hold; a reported one holds on until the estimate is on the good side again."""
-    holds = {
-        EventCode.LINK_BURSTS: (link.bursts, link.burst_statistic > 0.0),
-        EventCode.LINK_BELOW_DESIGN: (link.below_promise, link.arrival_mean < link.promised),
-    }
-    return tuple(code for code, (on, still) in holds.items() if on or (still and code in reported))
+    alarms: tuple[str, ...] = ()
+    if link.bursts or (link.burst_statistic > 0.0 and EventCode.LINK_BURSTS in reported):
+        alarms = (EventCode.LINK_BURSTS,)
+    if link.below_promise or (link.arrival_mean < link.promised and EventCode.LINK_BELOW_DESIGN in reported):
+        alarms = (*alarms, EventCode.LINK_BELOW_DESIGN)
+    return alarms
 
 
 def _report_link(alarms: tuple[str, ...], reported: tuple[str, ...], link: LinkEstimate | None) -> Iterable[Event]:

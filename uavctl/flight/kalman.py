@@ -64,7 +64,10 @@ class Kalman:
 
     propagation: Propagation  # F and G of z = (x, w)
     w: Array  # covariance W (n_w, n_w)
-    w_without_inertial: Array  # the same while the filter could use inertial data and has none (n_w, n_w)
+    # Covariance of z where w is drawn anew: W, and 0 between w and x (n_x + n_w, n_x + n_w)
+    drawn_cov: Array
+    drawn_cov_without_inertial: Array  # the same while the filter could use inertial data and has none
+    is_drawn: NDArray[np.bool_]  # which entries of a covariance of z these are (n_x + n_w, n_x + n_w)
     n_x: int  # number of states: the plant's, the biases, and what inertial data are off
     n_u: int  # number of inputs
     n_bias: int  # number of biases, behind the plant's states: n_u, or 0 where none is estimated
@@ -116,13 +119,18 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
     if n_inertial and n_bias:
         drift = slice(plant.n_w, plant.n_w + n_bias)
         w_without_inertial[drift, drift] *= DRIFT_WITHOUT_INERTIAL**2
-    identity = np.eye(model.n_x + model.n_w)
+    n_x, n_z = model.n_x, model.n_x + model.n_w
+    is_drawn = np.ones((n_z, n_z), dtype=np.bool_)
+    is_drawn[:n_x, :n_x] = False
+    identity = np.eye(n_z)
     measured_index = np.array(plant.position_index + plant.velocity_index, dtype=np.intp)
     return Kalman(
         propagation=make_propagation(model, dt_ns),
         w=model.w,
-        w_without_inertial=w_without_inertial,
-        n_x=model.n_x,
+        drawn_cov=np.pad(model.w, (n_x, 0)),
+        drawn_cov_without_inertial=np.pad(w_without_inertial, (n_x, 0)),
+        is_drawn=is_drawn,
+        n_x=n_x,
         n_u=plant.n_u,
         n_bias=n_bias,
         n_inertial=n_inertial,
@@ -192,27 +200,32 @@ def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_
     now_ns, mean, cov = belief.at_ns, belief.mean, belief.cov
     if now_ns >= at_ns:
         return belief
-    propagation, n_x = kalman.propagation, kalman.n_x
+    propagation = kalman.propagation
     acting = np.zeros(kalman.n_u) if u is None else u
     while now_ns < at_ns:
         boundary_ns = now_ns - (now_ns - origin_ns) % propagation.dt_ns + propagation.dt_ns
         stop_ns = min(at_ns, boundary_ns)
-        f, f_transposed, g = propagation.over(stop_ns - now_ns)
+        f, half_transposed, g = propagation.over(stop_ns - now_ns)
         # z = F z + G u
         mean = f.dot(mean)
         mean += g.dot(acting)
-        # P = F P F'
-        cov = _symmetric(f.dot(cov).dot(f_transposed))
+        # P = ½ F P F' + (½ F P F')'
+        half = f.dot(cov).dot(half_transposed)
+        cov = half.T.copy()
+        cov += half
         if stop_ns == boundary_ns:
-            # w ~ N(0, W), independent of x
-            mean[n_x:] = 0.0
-            cov[:n_x, n_x:] = 0.0
-            cov[n_x:, :n_x] = 0.0
-            cov[n_x:, n_x:] = kalman.w if _uses_inertial(belief.inertial, stop_ns) else kalman.w_without_inertial
+            _draw_disturbance(kalman, mean, cov, _uses_inertial(belief.inertial, stop_ns))
             if u is None and kalman.n_bias:
                 _reset_bias(kalman, mean, cov)
         now_ns = stop_ns
     return Belief(now_ns, belief.captured_ns, mean, cov, belief.inertial)
+
+
+def _draw_disturbance(kalman: Kalman, mean: Array, cov: Array, uses_inertial: bool) -> None:
+    """Draw the disturbance anew, in place: w ~ N(0, W), independent of x."""
+    mean[kalman.n_x :] = 0.0
+    drawn = kalman.drawn_cov if uses_inertial else kalman.drawn_cov_without_inertial
+    np.copyto(cov, drawn, where=kalman.is_drawn)
 
 
 def _uses_inertial(trust: InertialTrust, at_ns: int) -> bool:
@@ -242,7 +255,7 @@ def make_first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
     diagonal[index] = variances
     cov = np.zeros((n_x + n_w, n_x + n_w))
     cov[:n_x, :n_x] = np.diag(diagonal)
-    cov[n_x:, n_x:] = kalman.w_without_inertial
+    _draw_disturbance(kalman, mean, cov, uses_inertial=False)
     if kalman.n_bias:
         _reset_bias(kalman, mean, cov)
     if kalman.n_inertial:
@@ -289,8 +302,13 @@ def _correct_covariance(kalman: Kalman, cov: Array, gain: Array, of_z: Array, no
     """Correct a covariance by a measurement of matrix H = `of_z` (m, n) and noise of covariance R (m, m)."""
     # I - K H
     keep = kalman.identity - gain.dot(of_z)
-    # P = (I - K H) P (I - K H)' + K R K'; a copy of the transpose makes the product faster
-    return _symmetric(keep.dot(cov).dot(keep.T.copy()) + gain.dot(noise).dot(gain.T))
+    # P = (I - K H) P (I - K H)' + K R K', made symmetric; a copy of the transpose makes the product faster
+    half = keep.dot(cov).dot(keep.T.copy())
+    half += gain.dot(noise).dot(gain.T)
+    half *= 0.5
+    corrected: Array = half.T.copy()
+    corrected += half
+    return corrected
 
 
 def is_consistent(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> bool:
@@ -298,7 +316,7 @@ def is_consistent(kalman: Kalman, belief: Belief, values: Array, variances: Arra
     index = kalman.measured_index[: len(values)]
     innovation = values - belief.mean[index]
     # ν' S⁻¹ ν ≤ ν' ν / min R: where even that is well within, nothing has to be solved.
-    if float(innovation.dot(innovation)) <= 0.9 * inertial.MOST_CHI2 * float(variances.min()):
+    if float(innovation.dot(innovation)) <= 0.9 * inertial.MOST_CHI2 * min(variances.tolist()):
         return True
     noise = kalman.identity[: len(values), : len(values)] * variances
     # χ² = ν' (H P H' + R)⁻¹ ν
@@ -365,11 +383,16 @@ def update_with_inertial(kalman: Kalman, belief: Belief, accel_mps2: Array, u: A
     )
 
 
+def compute_position_variance(parameters: EstimatorParameters, sample: PositionSample) -> float:
+    """Compute the variance of a sample's position, each axis [m²]."""
+    return max(sample.std_m, parameters.position_std_m) ** 2
+
+
 def read_measurement(kalman: Kalman, sample: PositionSample) -> tuple[Array, Array]:
     """Return the values of a sample (positions, then velocities if it has them) and their variances."""
     parameters, axes = kalman.parameters, kalman.axes
     values = _select_axes(sample.position_m, axes)
-    variances = [max(sample.std_m, parameters.position_std_m) ** 2] * len(axes)
+    variances = [compute_position_variance(parameters, sample)] * len(axes)
     if sample.velocity_mps is not None:
         values += _select_axes(sample.velocity_mps, axes)
         variances += [parameters.velocity_std_mps**2] * len(axes)
@@ -378,11 +401,3 @@ def read_measurement(kalman: Kalman, sample: PositionSample) -> tuple[Array, Arr
 
 def _select_axes(vector: Vec3, axes: tuple[int, ...]) -> list[float]:
     return [vector[axis] for axis in axes]
-
-
-def _symmetric(matrix: Array) -> Array:
-    # (A + A') / 2
-    both: Array = matrix.T.copy()
-    both += matrix
-    both *= 0.5
-    return both

@@ -39,7 +39,14 @@ from uavctl.flight.estimator import (
     predict_belief,
     update_inertial,
 )
-from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, read_capture_ns, read_measurement
+from uavctl.flight.kalman import (
+    Belief,
+    EstimatorParameters,
+    Kalman,
+    compute_position_variance,
+    read_capture_ns,
+    read_measurement,
+)
 from uavctl.flight.monitors import frozen, jumps, noise, outliers
 from uavctl.flight.monitors.frozen import LastMotionNs, PredictedSample
 from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
@@ -288,10 +295,15 @@ def _judge_sample(
     width = outliers.compute_gate(reach, kalman, belief, variances, error_mps)
     outlier_track, verdict = outliers.update(sources.outliers, OutlierObservation(at_ns, offset, width, n_axes))
     if verdict.is_none:
+        later_error_mps = sources.velocity_error_mps
         if at_ns > (history.captured_ns or at_ns):
-            error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
-            sources = replace(sources, velocity_error_mps=error_mps)
-        sources = replace(sources, outliers=outlier_track, noise=noise.update(sources.noise, sample, at_ns))
+            later_error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
+        sources = replace(
+            sources,
+            velocity_error_mps=later_error_mps,
+            outliers=outlier_track,
+            noise=noise.update(sources.noise, sample, at_ns),
+        )
         if not sources.noise.is_known:
             return sources, NO_VERDICT
         return _judge_jump(kalman, sources, offset, _prepare_sample(sources, sample, at_ns), belief)
@@ -319,7 +331,7 @@ def _judge_jump(
     for axis, value in zip(kalman.axes, offset.tolist(), strict=False):
         offset_m[axis] = value
     # √(H P H' + R)
-    spread_m = np.sqrt(belief.cov[index, index] + read_measurement(kalman, counted)[1][:n_axes])
+    spread_m = np.sqrt(belief.cov.diagonal()[index] + compute_position_variance(kalman.parameters, counted))
     north, east, down = offset_m
     age_s = (at_ns - belief.captured_ns) * 1e-9
     track, is_refused = jumps.update(sources.jumps, (north, east, down), spread_m, at_ns, age_s)
@@ -336,7 +348,7 @@ def _find_last_motion_ns(before_ns: LastMotionNs, inputs: StepInput, at_rest_mps
     """Find when the vehicle last moved in each axis, by its own velocity; without one it counts as moving."""
     velocity = read_vehicle_velocity(inputs.motion, inputs.at_ns) or (math.inf,) * 3
     rows = zip(before_ns, velocity, strict=True)
-    north, east, down = (ns if abs(v) < at_rest_mps else inputs.at_ns for ns, v in rows)
+    north, east, down = [ns if abs(v) < at_rest_mps else inputs.at_ns for ns, v in rows]
     return north, east, down
 
 

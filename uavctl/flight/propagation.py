@@ -28,11 +28,11 @@ class Propagation:
     dt_ns: int  # δt [ns]
     whole: Array  # F and G side by side over Δt (n_x + n_w, n_x + n_w + n_u)
     series: Array  # chebyshev coefficients of the same in 2 dt/Δt - 1 (terms, its entries)
-    # F, F' and G of the first spans that were asked for: the ticks' own, which come again and again
+    # F, ½ F' and G of the first spans that were asked for: the ticks' own, which come again and again
     parts: dict[int, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
 
     def over(self, dt_ns: int) -> tuple[Array, Array, Array]:
-        """(F, F', G) over `dt_ns`, 0 < dt_ns <= Δt; each by itself in memory: products are faster so."""
+        """(F, ½ F', G) over `dt_ns`, 0 < dt_ns <= Δt; each by itself in memory: products are faster so."""
         known = self.parts.get(dt_ns)
         if known is None:
             known = self._part(dt_ns)
@@ -47,7 +47,7 @@ class Propagation:
             angle = math.acos(2.0 * dt_ns / self.dt_ns - 1.0)
             joint = (np.cos(angle * _ORDERS) @ self.series).reshape(self.whole.shape)
         n_z = joint.shape[0]
-        part = joint[:, :n_z].copy(), joint[:, :n_z].T.copy(), joint[:, n_z:].copy()
+        part = joint[:, :n_z].copy(), 0.5 * joint[:, :n_z].T.copy(), joint[:, n_z:].copy()
         for array in part:
             array.flags.writeable = False
         return part

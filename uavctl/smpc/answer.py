@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
 import numpy as np
 
 from uavctl.arrays import Array
@@ -19,16 +20,14 @@ INPUT_TOLERANCE = 1e-6
 KEPT_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Path:
+class Path(msgspec.Struct, frozen=True, eq=False):
     """A trajectory to follow, as deviations from the target."""
 
     states: Array  # (H, n_x): desired state of stage t minus the target
     inputs: Array  # (H, n_u): desired input of stage t minus the target's
 
 
-@dataclass(frozen=True, eq=False)
-class Preview:
+class Preview(msgspec.Struct, frozen=True, eq=False):
     """Preview of the steps of one plan: limits, path, age of the position, covariance."""
 
     # Right sides of the state rows in each stage (H+1, m_x); None: those of the design. The reference keeps those of

@@ -219,7 +219,7 @@ class Plant:
     def to_accel(self, u: Array) -> Vec3:
         """Return the acceleration setpoint [m/s²] of an input (n_u,); 0 in axes that the plant lacks."""
         accel = [0.0, 0.0, 0.0]
-        for column, value in zip(self._columns, (self._accel_map @ u).tolist(), strict=True):
+        for column, value in zip(self._columns, self._accel_map.dot(u).tolist(), strict=True):
             accel[column] = value
         return accel[0], accel[1], accel[2]
 

@@ -265,7 +265,7 @@ def test_the_spread_of_a_plan_depends_on_the_target_alone(name: str) -> None:
     assert (np.diff(np.array(reported, dtype=int)) <= 0).all()
     assert solver.select_risk(case.target, draw_preview("path", case, rng)) is solver.risk
     narrow = np.tile(case.state_set.b - margin, (case.horizon + 1, 1))  # a fence that has come to the target
-    assert solver.select_risk(case.target, replace(NOMINAL, limits=narrow)) is solver.risk
+    assert solver.select_risk(case.target, Preview(limits=narrow)) is solver.risk
 
 
 @pytest.mark.parametrize(("loss", "steps"), [(0.9, 12), (0.5, 3)])

@@ -202,7 +202,7 @@ def _track_repeat(track: SourceTrack, kalman: Kalman, history: FilterHistory, at
 
 def _track_change(track: SourceTrack, sample: PositionSample, at_ns: int, offset_m: Array) -> SourceTrack:
     moved_m = [abs(new - old) for new, old in zip(sample.position_m, track.position_m, strict=True)]
-    smallest_m = min(change_m for change_m in moved_m if change_m)
+    smallest_m = min([change_m for change_m in moved_m if change_m])
     noise_m = max(map(abs, offset_m.tolist()))
     changes = min(track.changes + 1, _ENOUGH_CHANGES)
     was_repeated = float(0 < track.repeats < _REPEATS)
@@ -215,11 +215,13 @@ def _track_change(track: SourceTrack, sample: PositionSample, at_ns: int, offset
         changes=changes,
         first_ns=at_ns,
         axis_changes=tuple(
-            min(n + bool(moved), _ENOUGH_CHANGES) for moved, n in zip(moved_m, track.axis_changes, strict=True)
+            [min(n + bool(moved), _ENOUGH_CHANGES) for moved, n in zip(moved_m, track.axis_changes, strict=True)]
         ),
-        axis_repeats=tuple(0 if moved else count + 1 for moved, count in zip(moved_m, track.axis_repeats, strict=True)),
+        axis_repeats=tuple(
+            [0 if moved else count + 1 for moved, count in zip(moved_m, track.axis_repeats, strict=True)]
+        ),
         axis_first_ns=tuple(
-            at_ns if moved else since for moved, since in zip(moved_m, track.axis_first_ns, strict=True)
+            [at_ns if moved else since for moved, since in zip(moved_m, track.axis_first_ns, strict=True)]
         ),
         gap_ns=at_ns - track.at_ns,
         spacing_ns=_find_spacing_ns(track, at_ns),

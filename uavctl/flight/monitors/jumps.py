@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
 from uavctl.arrays import Array
@@ -93,11 +92,13 @@ def _is_jump(track: JumpTrack, offset_m: Vec3, spread_m: Array, age_s: float) ->
     """Whether a position is far from its prediction, and the last one that counted was not on the way there."""
     # e = min(v t + ½ a t², e_max)
     error_m = min(ERROR_MPS * age_s + 0.5 * ERROR_MPS2 * age_s * age_s, LARGEST_ERROR_M)
-    bound_m = max(LEAST_JUMP_M, JUMP_SIGMA * float(np.max(spread_m)), error_m)
+    bound_m = max(LEAST_JUMP_M, JUMP_SIGMA * max(spread_m.tolist()), error_m)
     change = [now - before for now, before in zip(offset_m, track.offset_m, strict=True)]
+    if not min(math.hypot(*offset_m), math.hypot(*change)) > bound_m:
+        return False
     # ν_0' Δν > c |Δν|²
     grows = sum(b * c for b, c in zip(track.offset_m, change, strict=True)) > GROWN_PART * sum(c * c for c in change)
-    return min(math.hypot(*offset_m), math.hypot(*change)) > bound_m and not grows
+    return not grows
 
 
 def _confirm_jump(track: JumpTrack, offset_m: Vec3, jump_m: Vec3, at_ns: int) -> JumpTrack:

@@ -113,7 +113,7 @@ def _extend_vehicle_path(motion: Motion, observation: Observation) -> tuple[tupl
     last_ns, distance = path[-1]
     # s = s + Δt v
     s = (at_ns - last_ns) * 1e-9
-    distance = tuple(flown + s * v for flown, v in zip(distance, velocity, strict=True))
+    distance = tuple([flown + s * v for flown, v in zip(distance, velocity, strict=True)])
     kept = path[bisect_right(path, at_ns - KEPT_NS, key=_TIME) :]
     return (*kept, (at_ns, distance))
 
@@ -214,4 +214,4 @@ def find_distance(path: tuple[tuple[int, Vector], ...], at_ns: int) -> Vector | 
     (begin_ns, begin), (end_ns, end) = path[after - 1 : after + 1]
     # s = s_0 + (t - t_0) / (t_1 - t_0) (s_1 - s_0)
     part = (at_ns - begin_ns) / (end_ns - begin_ns)
-    return tuple(a + part * (b - a) for a, b in zip(begin, end, strict=True))
+    return tuple([a + part * (b - a) for a, b in zip(begin, end, strict=True)])

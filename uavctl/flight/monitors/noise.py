@@ -10,6 +10,7 @@ Frames that are wrong make smooth errors, which do not change the noise.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from statistics import median
 
 import msgspec
@@ -29,19 +30,12 @@ class NoiseTrack(msgspec.Struct, frozen=True):
 
     last: tuple[tuple[int, Vec3], ...] = ()  # up to two: capture time [ns], position [m]
     residuals_m: tuple[float, ...] = ()  # newest last, scaled to the noise of a single position
+    std_m: float = 0.0  # standard deviation of a position, each axis [m]; 0 where it is not known or usual
 
     @property
     def is_known(self) -> bool:
         """Whether positions have come close enough to one another, and for long enough."""
         return len(self.residuals_m) >= _LEAST_RESIDUALS
-
-    @property
-    def std_m(self) -> float:
-        """Standard deviation of a position, each axis [m]; 0 where it is not known or usual."""
-        if not self.is_known:
-            return 0.0
-        std_m = median(self.residuals_m) / _MEDIAN_3D
-        return min(std_m, LARGEST_STD_M) if std_m > USUAL_STD_M else 0.0
 
 
 def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
@@ -58,4 +52,12 @@ def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
             away_m = [m - (1.0 - c) * b - c * e for b, m, e in zip(begin_m, middle_m, end_m, strict=True)]
             residual_m = math.hypot(*away_m) / math.sqrt(1.0 + (1.0 - c) ** 2 + c * c)
             residuals_m = (*residuals_m, residual_m)[-_RESIDUALS:]
-    return NoiseTrack(last[-2:], residuals_m)
+    return NoiseTrack(last[-2:], residuals_m, _estimate_std_m(residuals_m))
+
+
+def _estimate_std_m(residuals_m: Sequence[float]) -> float:
+    """Estimate the standard deviation of a position [m]; 0 where too few residuals show it, or it is usual."""
+    if len(residuals_m) < _LEAST_RESIDUALS:
+        return 0.0
+    std_m = median(residuals_m) / _MEDIAN_3D
+    return min(std_m, LARGEST_STD_M) if std_m > USUAL_STD_M else 0.0

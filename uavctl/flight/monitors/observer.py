@@ -78,7 +78,8 @@ def extend_path(path: InertialPath, begin_ns: int, accel_mps2: Sequence[float], 
 
 def move_along(path: InertialPath, mean: Array, begin_ns: int, end_ns: int) -> Array:
     """Move position, velocity and unexplained acceleration (3, 3), a row each, along a path that is not empty."""
-    (begin_mps, begin_m), (end_mps, end_m) = (_find_span(path, at_ns).integrate(at_ns) for at_ns in (begin_ns, end_ns))
+    begin_mps, begin_m = _find_span(path, begin_ns).integrate(begin_ns)
+    end_mps, end_m = _find_span(path, end_ns).integrate(end_ns)
     s = (end_ns - begin_ns) * 1e-9
     half_s, moved = 0.5 * s, []
     for (p, v, d), v_0, p_0, v_1, p_1 in zip(mean.T.tolist(), begin_mps, begin_m, end_mps, end_m, strict=True):
@@ -107,25 +108,25 @@ def predict_observer(
         path: The path that inertial data show; empty for none.
         wander_mps2: Wander of the unexplained acceleration in a second.
     """
-    position, velocity, accel = _follow_setpoints(observer, sent, at_ns, lag_s)
+    mean, accel = _follow_setpoints(observer, sent, at_ns, lag_s)
     s = (at_ns - observer.at_ns) * 1e-9
     # P = F P F' + q² Q, with white jerk of density q
     f = np.array([[1.0, s, 0.5 * s * s], [0.0, 1.0, s], [0.0, 0.0, 1.0]])
-    q = np.array([[s**5 / 20, s**4 / 8, s**3 / 6], [s**4 / 8, s**3 / 3, s**2 / 2], [s**3 / 6, s**2 / 2, s]])
-    cov = f @ observer.cov @ f.T + wander_mps2**2 * q
+    q_pv, q_pd, q_vd = s**4 / 8, s**3 / 6, s**2 / 2
+    q = np.array([[s**5 / 20, q_pv, q_pd], [q_pv, s**3 / 3, q_vd], [q_pd, q_vd, s]])
+    cov = f.dot(observer.cov).dot(f.T) + wander_mps2**2 * q
     inertial = observer.inertial
     if path:
         if inertial is None:  # inertial data have just begun: from here on they explain all of it
             inertial = np.array([observer.mean[0], observer.mean[1], np.zeros(3)])
         inertial = move_along(path, inertial, observer.at_ns, at_ns)
-    mean = np.array([position, velocity, observer.mean[2]])
     return Observer(at_ns=at_ns, mean=mean, cov=cov, accel_mps2=accel, inertial=inertial)
 
 
 def _follow_setpoints(
     observer: Observer, sent: tuple[tuple[int, Vec3], ...], at_ns: int, lag_s: Vec3
-) -> tuple[Array, Array, Array]:
-    """Compute position, velocity and acceleration (3,) at a time, by the setpoints behind the vehicle's lag."""
+) -> tuple[Array, Array]:
+    """Compute the mean (3, 3) and the acceleration (3,) at a time, by the setpoints behind the vehicle's lag."""
     lags_s = [max(lag, LEAST_LAG_S) for lag in lag_s]
     position, velocity, unexplained = observer.mean.tolist()
     accel: list[float] = observer.accel_mps2.tolist()
@@ -146,7 +147,7 @@ def _follow_setpoints(
             position[i] = position[i] + s * velocity[i] + 0.5 * s * s * (u + d) + lag * (above * s - lagging)
             velocity[i] = velocity[i] + s * (u + d) + lagging
             accel[i] = u + above * remaining
-    return np.array(position), np.array(velocity), np.array(accel)
+    return np.array([position, velocity, unexplained]), np.array(accel)
 
 
 def _split_spans(
@@ -170,7 +171,7 @@ def correct_observer(observer: Observer, position: Array, std_m: float) -> tuple
     # P = (I - K H) P (I - K H)' + R K K'
     keep = _IDENTITY.copy()
     keep[:, :1] -= gain
-    cov = keep @ observer.cov @ keep.T + noise * (gain * gain.T)
+    cov = keep.dot(observer.cov).dot(keep.T) + noise * (gain * gain.T)
     inertial = observer.inertial
     if inertial is not None:
         inertial, is_far = _correct_mean(inertial, position, gain, bound)
@@ -195,7 +196,7 @@ def remove_drag(mean: Array) -> Array:
     """Return the unexplained acceleration (3,) without the part that can be drag, by the mean of an observer."""
     _, velocity, unexplained = mean
     # c = -d' v / v' v, within [0, c_max]; d + c v
-    along = float(velocity @ velocity)
-    drag_1ps = min(max(-float(unexplained @ velocity) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
+    along = float(velocity.dot(velocity))
+    drag_1ps = min(max(-float(unexplained.dot(velocity)) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
     rest: Array = unexplained + drag_1ps * velocity
     return rest

@@ -105,7 +105,7 @@ def compute_gate(reach: Reach, kalman: Kalman, belief: Belief, variances: Array,
     values = slice(len(variances))
     age_s = (belief.at_ns - belief.captured_ns) * 1e-9
     # w = σ √(H P H' + R) + Δy(age) + (margin + e age, e)
-    spread: Array = np.sqrt(np.diagonal(belief.cov)[kalman.measured_index[values]] + variances)
+    spread: Array = np.sqrt(belief.cov.diagonal()[kalman.measured_index[values]] + variances)
     doubted = np.concatenate((reach.parameters.margin_m + velocity_error_mps * age_s, velocity_error_mps))
     return reach.parameters.sigma * spread + (_reach_since(reach, belief) + doubted)[values]
 

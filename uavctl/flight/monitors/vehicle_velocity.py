@@ -14,7 +14,6 @@ missions were braked for a prediction).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import msgspec
@@ -100,5 +99,5 @@ def find_confirmed_velocity(monitors: MonitorState, motion: VehicleMotion | None
 
 def _is_near(velocity: Vec3, known: Sequence[float], within_mps: float) -> bool:
     """Whether no known axis is further apart."""
-    pairs = zip(velocity, known, strict=True)
-    return all(abs(own - value) <= within_mps for own, value in pairs if not math.isnan(value))
+    # An unknown value is NaN, and no difference from it is larger than anything.
+    return not any(abs(own - value) > within_mps for own, value in zip(velocity, known, strict=True))

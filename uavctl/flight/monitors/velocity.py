@@ -24,6 +24,7 @@ from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
+from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import PositionObservation, TickObservation, find_distance
 from uavctl.flight.monitors.noise import USUAL_STD_M
 from uavctl.flight.monitors.observation import EnvelopeParameters, describe_vector
@@ -93,8 +94,10 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
         return replace(state, offsets=offsets, places=places, apart_mps=None, apart_ns=None), NO_VERDICT
     resumed_ns = observation.motion.resumed_ns
     corrects = resumed_ns is not None and at_ns - parameters.window_ns < resumed_ns + CORRECTS_NS
-    drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, points, path, parameters)
-    apart = _remove_delay(slope, path, offsets)
+    span_s, (begin, middle, end) = _find_way(path, offsets)
+    velocity = _find_mean_velocity(begin, end, span_s)
+    drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, points, velocity, parameters)
+    apart = _remove_delay(slope, begin, middle, end, span_s)
     apart_mps = math.hypot(*apart)
     bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, observation.std_m)
     is_contradicted = apart_mps > bound_mps
@@ -129,8 +132,8 @@ def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:
     if distance is None:
         return ()
     since_ns = at_ns - observation.parameters.window_ns
-    kept = (one for one in offsets if one[0] > since_ns)
-    offset = tuple(p - s for p, s in zip(observation.position.tolist(), distance, strict=True))
+    kept = offsets[bisect_right(offsets, since_ns, key=_TIME) :]
+    offset = tuple([p - s for p, s in zip(observation.position.tolist(), distance, strict=True)])
     return (*kept, (at_ns, offset))
 
 
@@ -147,38 +150,49 @@ def _find_return(
 
 
 def _find_drift(
-    places: Places,
-    offsets: Offsets,
-    points: Array,
-    path: tuple[tuple[int, Vector], ...],
-    parameters: EnvelopeParameters,
+    places: Places, offsets: Offsets, points: Array, velocity: Vector, parameters: EnvelopeParameters
 ) -> tuple[tuple[float, list[float]] | None, Places]:
-    """Find the time [s] in which offsets changed too much, and the change (3,) [m]; return too the places after it."""
-    at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
+    """Find the time [s] in which offsets changed too much, and the change (3,) [m]; return too the places after it.
+
+    Args:
+        velocity: The vehicle's own mean velocity over the window (3,) [m/s].
+    """
+    at_ns = sum([captured_ns for captured_ns, _ in offsets]) // len(offsets)
     # ō = Σ o_i / n
     mean: Array = np.add.reduce(points, axis=0) / len(offsets)
     place: list[float] = mean.tolist()
     places = places[bisect_right(places, at_ns - PLACES_NS, key=_TIME) :]
-    velocity = _find_mean_velocity(path, offsets)
     for since_ns, before, velocity_before in places:
-        s, off = (at_ns - since_ns) * 1e-9, [now - then for now, then in zip(place, before, strict=True)]
-        off = _remove_smoothing(off, [now - then for now, then in zip(velocity, velocity_before, strict=True)])
+        s = (at_ns - since_ns) * 1e-9
         # |ō - ō_0| > (2 s + 0.16 s) v_max
-        if math.hypot(*off) > (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps:
+        bound_m = (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps
+        if math.dist(place, before) <= bound_m:
+            continue
+        off = [now - then for now, then in zip(place, before, strict=True)]
+        off = _remove_smoothing(off, [now - then for now, then in zip(velocity, velocity_before, strict=True)])
+        if math.hypot(*off) > bound_m:
             return (s, off), places
     if not places or at_ns - places[-1][0] >= PLACE_NS:
         places = (*places, (at_ns, tuple(place), velocity))
     return None, places
 
 
-def _find_mean_velocity(path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> Vector:
+def _find_way(path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> tuple[float, list[Vector | None]]:
+    """Find the time of the window [s], and the vehicle's own distance (3,) [m] at its begin, in its middle and its end.
+
+    A distance is None where it is not known.
+    """
+    begin_ns, end_ns = offsets[0][0], offsets[-1][0]
+    times_ns = begin_ns, (begin_ns + end_ns) // 2, end_ns
+    return (end_ns - begin_ns) * 1e-9, [find_distance(path, at_ns) for at_ns in times_ns]
+
+
+def _find_mean_velocity(begin: Vector | None, end: Vector | None, span_s: float) -> Vector:
     """Find the vehicle's own mean velocity (3,) [m/s] over the window; zero where it is not known."""
-    (begin_ns, _), (end_ns, _) = offsets[0], offsets[-1]
-    begin, end = find_distance(path, begin_ns), find_distance(path, end_ns)
     if begin is None or end is None:
-        return 0.0, 0.0, 0.0
+        return ZERO
     # v̄ = (s_1 - s_0) / T
-    return tuple((s_1 - s_0) / ((end_ns - begin_ns) * 1e-9) for s_0, s_1 in zip(begin, end, strict=True))
+    return tuple([(s_1 - s_0) / span_s for s_0, s_1 in zip(begin, end, strict=True)])
 
 
 def _remove_smoothing(off: list[float], change_mps: list[float]) -> list[float]:
@@ -198,7 +212,7 @@ def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) 
     times_s = np.array([(at_ns - offsets[0][0]) * 1e-9 for at_ns, _ in offsets])
     # slope = Σ (t_i - t̄) o_i / Σ (t_i - t̄)²
     centred = times_s - np.add.reduce(times_s) / len(times_s)
-    slope: Array = centred @ points / float(centred @ centred)
+    slope: Array = centred.dot(points) / float(centred.dot(centred))
     return slope
 
 
@@ -211,19 +225,20 @@ def _bound_noise_mps(offsets: Offsets, std_m: float) -> float:
     return NOISE_SIGMA * std_m / math.hypot(*((at_ns - offsets[0][0] - mean_ns) * 1e-9 for at_ns, _ in offsets))
 
 
-def _remove_delay(apart: Array, path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> Array:
+def _remove_delay(
+    apart: Array, begin: Vector | None, middle: Vector | None, end: Vector | None, span_s: float
+) -> Array:
     """Return a difference of velocities (3,) without the part that late stamps explain.
 
     Late stamps make a difference of the mean acceleration, by the vehicle's own distance, times their delay.
     """
-    (begin_ns, _), (end_ns, _) = offsets[0], offsets[-1]
-    begin, middle, end = (find_distance(path, at_ns) for at_ns in (begin_ns, (begin_ns + end_ns) // 2, end_ns))
     if begin is None or middle is None or end is None:
         return apart
     # ā = 4 (s_0 - 2 s_½ + s_1) / T²
-    accel = (np.array(begin) - 2.0 * np.array(middle) + np.array(end)) * 4.0 / ((end_ns - begin_ns) * 1e-9) ** 2
-    along = float(accel @ accel)
+    rows = zip(begin, middle, end, strict=True)
+    accel = np.array([(s_0 - 2.0 * s_half + s_1) * 4.0 / span_s**2 for s_0, s_half, s_1 in rows])
+    along = float(accel.dot(accel))
     # τ = -Δv' ā / ā' ā, within ±0.15 s; Δv + τ ā
-    late_s = min(max(-float(apart @ accel) / along, -LATE_S), LATE_S) if along > 0.0 else 0.0
+    late_s = min(max(-float(apart.dot(accel)) / along, -LATE_S), LATE_S) if along > 0.0 else 0.0
     rest: Array = apart + late_s * accel
     return rest

@@ -19,7 +19,9 @@ False alarms: none in flights without a lie in blackouts and wind (tests/e2e/tes
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
+from operator import itemgetter
 
 import msgspec
 from msgspec.structs import replace
@@ -34,9 +36,8 @@ PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one messa
 INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 RECENT_NS = 300_000_000  # an agreement counts for so long
-LEAP = (
-    2.0  # disagreements by which a velocity leaps from one message to the next: no force does that in so short a time
-)
+LEAP = 2.0  # disagreements between two messages: no force changes a velocity by more in so short a time
+_TIME = itemgetter(0)  # of samples, oldest first
 
 Sample = tuple[int, Vector, Vector, Vector]  # time [ns]; own velocity, integral of inertial data, model's [m/s]
 
@@ -54,8 +55,8 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     @property
     def contradicts(self) -> bool:
         """Whether both changes contradict each other, or one of them was found wrong."""
-        found = (self.disagrees_ns, self.velocity_wrong_ns, self.inertial_wrong_ns)
-        return any(since_ns is not None for since_ns in found)
+        is_found = self.velocity_wrong_ns is not None or self.inertial_wrong_ns is not None
+        return is_found or self.disagrees_ns is not None
 
     def supports_velocity(self, at_ns: int) -> bool:
         """Whether inertial data have changed as the own velocity has, just now."""
@@ -77,7 +78,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     if state.samples and state.samples[-1][0] >= own_ns:
         return state
     gained, _ = motion.inertial_path[-1].integrate(own_ns)
-    kept = tuple(sample for sample in state.samples if own_ns - sample[0] <= WINDOW_NS)
+    kept = state.samples[bisect_left(state.samples, own_ns - WINDOW_NS, key=_TIME) :]
     sample = (own_ns, own, tuple(gained), motion.model_mps)
     state = replace(state, samples=(*kept, sample))
     if state.inertial_wrong_ns is not None:
@@ -100,7 +101,7 @@ def _compare(
         unexplained_mps2: Acceleration that positions showed last beside the setpoints: wind and drag.
     """
     s = (last[0] - first[0]) * 1e-9
-    own, gained, model = (_subtract(now, then) for now, then in zip(last[1:], first[1:], strict=True))
+    own, gained, model = [_subtract(now, then) for now, then in zip(last[1:], first[1:], strict=True)]
     knows_wrong = state.velocity_wrong_ns is not None
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t
     if not knows_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
@@ -160,4 +161,4 @@ def _believe_again(
 
 
 def _subtract(a: Sequence[float], b: Sequence[float]) -> Vector:
-    return tuple(x - y for x, y in zip(a, b, strict=True))
+    return tuple([x - y for x, y in zip(a, b, strict=True)])

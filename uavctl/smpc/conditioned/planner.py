@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
+import msgspec
 import numpy as np
 
 from uavctl.arrays import Array
@@ -66,8 +67,7 @@ MAX_ROUNDS = (
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
-@dataclass(frozen=True, eq=False)
-class _RowBackoffs:
+class _RowBackoffs(msgspec.Struct, frozen=True, eq=False):
     """Back-offs of the rows in each stage, for a covariance and an age."""
 
     sigma: Array  # standard deviations (H, m)
@@ -88,8 +88,17 @@ class _Allocation:
     reference_backoffs: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _PlanResult:
+class _Rest(msgspec.Struct, frozen=True, eq=False):
+    """Where a plan to a target rests, and what follows from it for any state."""
+
+    allocation: _Allocation  # allocation of the risk
+    reference: Array  # equilibrium that the plan ends in (n_x,)
+    sides: Array  # right sides of the state rows minus their values at the reference, (H, m) or (m,)
+    equilibrium_input: Array | None  # input there (n_u,); None for zero
+    offset: float  # l1 distance of the reference from the target, in equilibrium coordinates
+
+
+class _PlanResult(msgspec.Struct, frozen=True, eq=False):
     """A plan: z of each program that was solved, the back-offs (H, m), the margin (H, m) and the iterations."""
 
     z_of_program: Sequence[tuple[PartProgram, Array]]
@@ -190,6 +199,7 @@ class ConditionedSolver:
         # Without limits of a preview: bounds on a target far from limits, and on one that needs no reference
         self._plain_far = (self._b - self._far)[self._reference_rows]
         self._plain_near = (self._b - self._near.reference_backoffs[0])[self._reference_rows]
+        self._cached_rest: tuple[bytes, _Rest] | None = None
         self._cached_backoffs: tuple[tuple[bool, int, bytes], _RowBackoffs] | None = None
 
     @property
@@ -218,21 +228,15 @@ class ConditionedSolver:
         """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); see `Solver`."""
         if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
-        limits = self._limits(preview)
-        placed = self._placed.dot(target[self._equilibria.held])
-        row_backoffs = self._find_row_backoffs(self._select_allocation(placed, limits, preview), preview)
-        reference = self._find_reference(target, placed, limits)
-        equilibrium_input = (
-            self._equilibria.u_eq @ reference[self._equilibria.held] if self._has_equilibrium_input else None
-        )
+        rest = self._find_rest(target, preview)
+        reference, equilibrium_input = rest.reference, rest.equilibrium_input
+        row_backoffs = self._find_row_backoffs(rest.allocation, preview)
         first = (
             None if preview.sent is None or not self._slew.axes.size else self._slew.measure_first_step(preview.sent)
         )
         dx = x - reference
         lower, upper, tightening = self._find_input_bounds(preview)
-        margin_x, hard = self._regulated.compute_margin(
-            dx, limits - self._c @ reference, equilibrium_input, first, tightening
-        )
+        margin_x, hard = self._regulated.compute_margin(dx, rest.sides, equilibrium_input, first, tightening)
         path_z: list[tuple[PartProgram, Array]] = []
         if preview.path is not None:
             path_z = [
@@ -256,9 +260,6 @@ class ConditionedSolver:
         inputs, kept = self._clip(inputs, bool(result.z_of_program), lower, upper)
         backoff_x = np.zeros((len(states), self.problem.state_set.b.size))
         backoff_x[1:, slice(None) if self._in_order else self._rows] = result.backoff
-        offset = 0.0
-        if reference is not target:
-            offset = float(np.abs((reference - target)[self._equilibria.held]).sum())
         return Answer(
             seq=seq,
             status=SolveStatus.OPTIMAL if kept else SolveStatus.INACCURATE,
@@ -269,13 +270,34 @@ class ConditionedSolver:
             backoff_u=self._no_backoff,
             reference=np.array(reference),
             slack=slack,
-            offset=offset,
+            offset=rest.offset,
             terminal_miss=0.0,
             cost=cost,
             cost_lower=-np.inf,  # the allocation of the risk is not convex, and each program is solved to rounding
             gap=np.inf,
             iterations=result.iterations,
             relaxed=relaxed,
+        )
+
+    def _find_rest(self, target: Array, preview: Preview) -> _Rest:
+        """Find where a plan rests; that of the last target is kept, by its bits, without limits or a path."""
+        if preview.limits is not None or preview.path is not None:
+            return self._make_rest(target, preview)
+        key = target.tobytes()
+        if self._cached_rest is None or self._cached_rest[0] != key:
+            self._cached_rest = key, self._make_rest(target, preview)
+        return self._cached_rest[1]
+
+    def _make_rest(self, target: Array, preview: Preview) -> _Rest:
+        held, limits = self._equilibria.held, self._limits(preview)
+        placed = self._placed.dot(target[held])
+        reference = self._find_reference(target, placed, limits)
+        return _Rest(
+            allocation=self._select_allocation(placed, limits, preview),
+            reference=reference,
+            sides=limits - self._c.dot(reference),
+            equilibrium_input=self._equilibria.u_eq @ reference[held] if self._has_equilibrium_input else None,
+            offset=float(np.abs((reference - target)[held]).sum()),
         )
 
     def _limits(self, preview: Preview) -> Array:
@@ -315,10 +337,10 @@ class ConditionedSolver:
         if limits is not self._b:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
             kept = (sides - self._near.reference_backoffs[0])[self._reference_rows]
-        count = np.count_nonzero(placed > kept)
+        reference, count = np.array(target), np.count_nonzero(placed > kept)
         if not count:
-            return target
-        reference, distance = np.array(target), self._near.reference_backoffs[min(int(count), len(self._parts)) - 1]
+            return reference
+        distance = self._near.reference_backoffs[min(int(count), len(self._parts)) - 1]
         for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
@@ -400,7 +422,7 @@ class ConditionedSolver:
         problem = self.problem
         if preview.path is None:
             # x_0'P x_0 + |z|²
-            cost = dx[0] @ self._tail @ dx[0] + sum([z.dot(z) for _, z in result.z_of_program])
+            cost = dx[0].dot(self._tail).dot(dx[0]) + sum([z.dot(z) for _, z in result.z_of_program])
         else:
             # Σ_t (x_t - p_t)'Q_x(x_t - p_t) + (u_t - r_t)'Q_u(u_t - r_t) + x_H'P x_H
             last, dx, du = dx[-1], dx[:-1] - preview.path.states, du - preview.path.inputs

@@ -68,7 +68,7 @@ class SlewRows:
 
         The change is `side`, or the distance of the nearest input in U, so that the first row is feasible.
         """
-        d_sent = self.d @ sent
+        d_sent = self.d.dot(sent)
         if self._box and all(map(le, self._lows, sent.tolist())) and all(map(le, sent.tolist(), self._highs)):
             return d_sent, self._sides
         distance = np.abs(self.d @ self._clip(sent) - d_sent)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from msgspec import structs
 
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
@@ -191,7 +192,7 @@ class ConicSolver:
         if not is_finite(x, target, preview) or preview.age > len(self._design.late):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         if preview.age:
-            return self._find_late_solver(preview.age).solve(seq, x, target, replace(preview, age=0))
+            return self._find_late_solver(preview.age).solve(seq, x, target, structs.replace(preview, age=0))
         parts = [(part.component, part.solve(x, target, preview)) for part in self._parts]
         return assemble(self._design, seq, METHOD, x, parts, preview)
 
