@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from question_rig import case, near, small, uniform
@@ -13,24 +15,31 @@ from uavctl.smpc.batch import BatchSmpc, Information, SequentialDecider
 from uavctl.smpc.hahn_stursberg.shortcut import FROZEN, ShortcutDecider, ShortcutSolver
 
 
-def decider() -> ShortcutDecider:
+@cache
+def sequential_solver() -> ShortcutSolver:
+    return ShortcutSolver(case("paper").design, sequential=True)
+
+
+def decider(*, sequential: bool = False) -> ShortcutDecider:
     item = case("paper")
-    return ShortcutDecider(item.solver, item.design.target)
+    return ShortcutDecider(sequential_solver() if sequential else item.solver, item.design.target)
 
 
-def test_answers_are_those_that_fly_bit_for_bit() -> None:
-    """Frozen answers, exact ones, and those where one axis needs the exact program."""
+@pytest.mark.parametrize("sequential", [False, True])
+def test_answers_are_those_of_single_questions_bit_for_bit(sequential: bool) -> None:
+    """Frozen answers, exact ones, and those where the axes have different methods."""
     item, rng = case("paper"), np.random.default_rng(11)
+    solver = sequential_solver() if sequential else item.solver
     x = np.array([uniform(item.design, rng) if i % 2 else near(item.design, rng) for i in range(40)])
-    result, methods = decider().decide(x, 0), []
+    result, methods = decider(sequential=sequential).decide(x, 0), []
     for i, state in enumerate(x):
-        answer = item.solver.solve(0, state, item.design.target)
+        answer = solver.solve(0, state, item.design.target)
         assert result.solved[i] == (answer.status is SolveStatus.OPTIMAL)
         np.testing.assert_array_equal(result.inputs[i], answer.inputs)
         numbers = result.slack[i], result.cost[i], result.gap[i]
         assert numbers == (answer.slack, answer.cost, answer.gap)
         methods.append(answer.method)
-    assert min(methods.count("frozen"), methods.count("exact")) > 5
+    assert min(methods.count("frozen"), methods.count("sequential" if sequential else "exact")) > 5
 
 
 class Counting:
@@ -57,13 +66,15 @@ def test_no_questions_have_an_empty_answer() -> None:
     assert decider().decide(np.zeros((0, 4)), 0).inputs.shape == (0, 12, 2)
 
 
-def test_order_and_number_of_states_change_nothing() -> None:
+@pytest.mark.parametrize("sequential", [False, True])
+def test_order_and_number_of_states_change_nothing(sequential: bool) -> None:
     item, rng = case("paper"), np.random.default_rng(17)
     x = np.array([near(item.design, rng) for _ in range(30)])
     x = np.vstack([x, x[:10]])
     order = rng.permutation(len(x))
-    together, shuffled = decider().decide(x, 0), decider().decide(x[order], 0)
-    single = np.vstack([decider().decide(row[None], 0).inputs for row in x])
+    tested = decider(sequential=sequential)
+    together, shuffled = tested.decide(x, 0), tested.decide(x[order], 0)
+    single = np.vstack([tested.decide(row[None], 0).inputs for row in x])
     np.testing.assert_array_equal(shuffled.inputs, together.inputs[order])
     np.testing.assert_array_equal(single, together.inputs)
 

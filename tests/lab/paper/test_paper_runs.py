@@ -48,8 +48,7 @@ def setup() -> Setup:
     return Setup(config, design)
 
 
-@pytest.fixture(scope="module")
-def directly(setup: Setup) -> tuple[Trajectories, BatchSmpc]:
+def fly_directly(setup: Setup, *, sequential: bool) -> tuple[Trajectories, BatchSmpc]:
     """The same runs with nothing of this command in between."""
     design, plant = setup.design, build_plant(setup.config)
     chances = draw(SEED, 0, RUNS, STEPS, plant.n_w)
@@ -57,9 +56,15 @@ def directly(setup: Setup) -> tuple[Trajectories, BatchSmpc]:
         plant, design.state_set, design.input_set, design.q_x, design.q_u, np.zeros(4), np.zeros(2),
         np.tile([35.0, -2.0, -20.0, -4.0], (RUNS, 1)),
     )  # fmt: skip
-    smpc = BatchSmpc(ShortcutDecider(ShortcutSolver(design), np.zeros(4)), plant, 12, 0, 0.5)
+    solver = ShortcutSolver(design, sequential=sequential)
+    smpc = BatchSmpc(ShortcutDecider(solver, np.zeros(4)), plant, 12, 0, 0.5)
     w = chances.normal * np.sqrt(0.6)
     return simulate(scene, smpc, compute_newest_captures(setup.config.link, 1.0, chances.link), w), smpc
+
+
+@pytest.fixture(scope="module")
+def directly(setup: Setup) -> tuple[Trajectories, BatchSmpc]:
+    return fly_directly(setup, sequential=True)
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +93,14 @@ def test_figures_are_those_of_the_runs(result: VariantResult, directly: tuple[Tr
     low, high = np.array([-30, -8, -25, -8]), np.array([50, 7, 20, 8])
     room = np.stack([high - flown.states[:, 1:].max((0, 1)), flown.states[:, 1:].min((0, 1)) - low], axis=1)
     assert result.closest == pytest.approx(room.ravel())
+
+
+def test_runs_are_those_of_the_exact_program(setup: Setup, directly: tuple[Trajectories, BatchSmpc]) -> None:
+    """To the accuracy of the exact program: its gap of 1e-8 leaves a few 1e-6 in the states."""
+    sequential, exact = directly[0], fly_directly(setup, sequential=False)[0]
+    assert sequential.states == pytest.approx(exact.states, abs=1e-4)
+    assert sequential.cost.sum(axis=1) == pytest.approx(exact.cost.sum(axis=1), rel=1e-8)
+    np.testing.assert_array_equal(sequential.age, exact.age)
 
 
 def test_chunks_change_nothing(setup: Setup, result: VariantResult, monkeypatch: pytest.MonkeyPatch) -> None:

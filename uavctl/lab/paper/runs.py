@@ -87,7 +87,9 @@ class ChunkRunner:
     def __init__(self, setup: Setup) -> None:
         config, design = setup.config, setup.design
         self._setup, self.design = setup, design
-        self._checked_decider = TerminalCheckDecider(ShortcutDecider(ShortcutSolver(design), design.target), design)
+        self._checked_decider = TerminalCheckDecider(
+            ShortcutDecider(ShortcutSolver(design, sequential=True), design.target), design
+        )
         self._smpc = BatchSmpc(
             self._checked_decider, build_plant(config), design.horizon, len(design.late), config.fallback.brake_gain_1ps
         )

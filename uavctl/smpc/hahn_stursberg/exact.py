@@ -24,6 +24,7 @@ from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.cones import BREAKDOWN, Expression, ProgramBuilder, Solution
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon, TerminalBound, make_horizon, stack_rows, terminal_bound
+from uavctl.smpc.hahn_stursberg.mean import MeanPlan
 from uavctl.smpc.hahn_stursberg.program import Program, terminal_backoff_x
 
 # Status of a plan: the worst of its components, the later in this list.
@@ -57,6 +58,25 @@ class PartAnswer:
         """Return an answer without a plan."""
         empty = np.zeros((0, 0))
         return cls(status, iterations, empty, empty, empty, np.zeros(0), np.inf, np.inf, np.inf, np.inf, -np.inf)
+
+    @classmethod
+    def proven(
+        cls, plan: MeanPlan, i: int, backoffs: tuple[Array, Array], cost: np.float64, cost_lower: np.float64
+    ) -> PartAnswer:
+        """Return plan `i` as the optimum, without slack, with the back-offs of its state and input rows."""
+        return cls(
+            status=SolveStatus.OPTIMAL,
+            iterations=0,
+            inputs=plan.inputs[i],
+            backoff_x=backoffs[0],
+            backoff_u=backoffs[1],
+            reference=plan.reference[i],
+            slack=0.0,
+            offset=float(plan.off_target[i].sum()),
+            terminal_miss=0.0,
+            cost=float(cost),
+            cost_lower=float(cost_lower),
+        )
 
 
 def assemble(

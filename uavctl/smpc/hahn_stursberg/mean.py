@@ -9,14 +9,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
-from uavctl.smpc.answer import NOMINAL, Preview
+from uavctl.smpc.answer import NOMINAL, Preview, clip_inputs
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon
 from uavctl.smpc.hahn_stursberg.program import factorise, terminal_backoff_u, terminal_backoff_x
@@ -24,6 +24,9 @@ from uavctl.smpc.qp import OPEN
 from uavctl.smpc.sets import find_pairs
 
 Index = NDArray[np.intp]
+
+# Largest relative gap of an accepted answer: the exact program's own tolerance.
+MAX_GAP = 1e-7
 
 # Smaller singular values of the terminal equality count as 0: N steps do not reach these directions.
 _RANK = 1e-9
@@ -66,6 +69,19 @@ class Question:
     lower: Array  # left sides (m,) alike
     p: Array  # parameters (…, n_p)
 
+    def select(self, index: NDArray[np.bool_] | Index) -> Question:
+        """Return some of several questions."""
+        return replace(self, f=self.f[index], constant=self.constant[index], offset=self.offset[index], p=self.p[index])
+
+
+@dataclass(frozen=True, eq=False)
+class MeanPlan:
+    """Plans of M questions."""
+
+    inputs: Array  # mean inputs within their limits (M, H, n_u)
+    reference: Array  # equilibria at their ends (M, n_x)
+    off_target: Array  # distances |y - y_target| (M, n_y)
+
 
 class MeanProblem:
     """Cost and rows of one component's mean; constant parts are computed once.
@@ -101,6 +117,7 @@ class MeanProblem:
         self.gain_rows = np.array([i for i, row in enumerate(self.rows) if row.noise is not None], dtype=np.intp)
         kinds = np.array([row.kind for row in self.rows])
         self._limited_rows = np.flatnonzero(np.isin(kinds, (RowKind.STATE, RowKind.REFERENCE)))
+        self._offset_rows = np.flatnonzero(kinds == RowKind.OFFSET)
         maps = [self._map_row(row) for row in self.rows]
         self.a = np.array([w @ self.z for w, _ in maps])  # A (m, n_q)
         self.r = np.array([w @ self.w + p for w, p in maps])  # R (m, n_p)
@@ -158,6 +175,18 @@ class MeanProblem:
             upper=np.minimum(upper, OPEN),
             lower=np.maximum(lower, -OPEN),
             p=p,
+        )
+
+    def read_plan(self, question: Question, q: Array) -> MeanPlan:
+        """Return the plans of the means q (M, n_q) of M questions."""
+        part = self.horizon.component
+        y_now = question.p[:, self.n_p - self.n_y :]
+        w = multiply_rows(q, self.z.T) + multiply_rows(question.p, self.w.T)
+        inputs = self.inputs(w, y_now)
+        return MeanPlan(
+            inputs=clip_inputs(inputs.reshape(-1, inputs.shape[2]), part.c_u, part.b_u)[0].reshape(inputs.shape),
+            reference=multiply_rows(w[:, self.n_v :] + y_now, part.x_eq.T),
+            off_target=np.abs(multiply_rows(q, self.a[self._offset_rows].T) + question.offset[:, self._offset_rows]),
         )
 
     def inputs(self, w: Array, y_now: Array) -> Array:

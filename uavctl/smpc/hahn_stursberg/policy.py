@@ -44,6 +44,7 @@ class Policy:
     cost: float  # J_cov
     level: float  # D of the cut
     slope: Array  # μ (n_l,), >= 0
+    terminal: Array  # multiplier Z⁺ of the terminal matrix (order, order), positive semi-definite
 
 
 class CovarianceProblem:
@@ -85,7 +86,7 @@ class CovarianceProblem:
             return False
         if not self.order:
             return True
-        matrix = _unpack_triangle(self.triangle.evaluate(theta), self.order)
+        matrix = unpack_triangle(self.triangle.evaluate(theta), self.order)
         return bool(np.linalg.eigvalsh(matrix)[0] >= -_MAX_VIOLATION)
 
     def make_policy(self, theta: Array, equal: Array, triangle: Array, heads: Array, tails: Sequence[Array]) -> Policy:
@@ -102,8 +103,10 @@ class CovarianceProblem:
         backoff = self.backoffs(theta)
         level, residual = self.horizon.c_0, self.horizon.q - self.equal.matrix.T @ equal
         level -= float(self.equal.offset @ equal)
+        terminal = np.zeros((0, 0))
         if self.order:
             positive = _positive_part(triangle, self.order)
+            terminal = unpack_triangle(positive, self.order)
             residual = residual - self.triangle.matrix.T @ positive
             level -= float(self.triangle.offset @ positive)
         slope = np.zeros(self.kappa.size)
@@ -116,7 +119,7 @@ class CovarianceProblem:
         along = self._vectors.T @ residual
         # P is definite; smaller eigenvalues are rounding. A curvature that is too small only loosens the cut.
         level -= 0.5 * float(np.sum(along**2 / np.maximum(self._values, 1e-16 * self._values.max(initial=0.0))))
-        return Policy(theta, backoff, self.cost(theta), level, slope)
+        return Policy(theta, backoff, self.cost(theta), level, slope, terminal)
 
 
 def cheapest_policy(problem: MeanProblem, max_iterations: int) -> Policy | None:
@@ -198,14 +201,14 @@ def _svec_weight(order: int) -> Array:
 
 def _positive_part(svec: Array, order: int) -> Array:
     """Project a symmetric matrix, upper triangle by columns with off-diagonals times √2, on the semidefinite cone."""
-    values, vectors = np.linalg.eigh(_unpack_triangle(svec, order))
+    values, vectors = np.linalg.eigh(unpack_triangle(svec, order))
     positive = (vectors * np.maximum(values, 0.0)) @ vectors.T
     row, column = _triangle_indices(order)
     projected: Array = _svec_weight(order) * positive[row, column]
     return projected
 
 
-def _unpack_triangle(svec: Array, order: int) -> Array:
+def unpack_triangle(svec: Array, order: int) -> Array:
     """Return the symmetric matrix of such a triangle."""
     row, column = _triangle_indices(order)
     matrix = np.zeros((order, order))

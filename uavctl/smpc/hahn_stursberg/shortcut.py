@@ -6,7 +6,8 @@
    most those of the policy, and no other gain row has a multiplier (theory notes, D). A row with slack has its price as
    multiplier: such an answer is refused too.
 3. An accepted answer has a proof: the Lagrangian's value at its multipliers is a lower bound of the optimum.
-4. All other questions go to the exact program, component by component.
+4. Other questions go to sequential quadratic programming, if that is asked for, and what is left to the exact program,
+   component by component.
 """
 
 from __future__ import annotations
@@ -18,25 +19,27 @@ from numpy.typing import NDArray
 
 from uavctl.arrays import Array
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, clip_inputs, relative_gap
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, relative_gap
 from uavctl.smpc.batch import Decisions
 from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, PartAnswer, PartSolver, assemble
-from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind, dot_rows, multiply_rows
+from uavctl.smpc.hahn_stursberg.mean import MAX_GAP, MeanProblem, RowKind, dot_rows, multiply_rows
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
+from uavctl.smpc.hahn_stursberg.sequential import SequentialProgram, make_sequential_program
 from uavctl.smpc.qp import EQUAL, SOFT, QuadraticProgram
 
 FROZEN = "frozen"  # method of an answer without an exact program
+
+SEQUENTIAL = "sequential"  # method of an answer by sequential quadratic programming
+
+_METHODS = (FROZEN, SEQUENTIAL, METHOD)  # the method of a plan is that of the component latest in this list
 
 # A multiplier below this share of a typical cost counts as 0.
 _ZERO_SHARE = 1e-11
 
 # Squares of larger numbers, and of what follows from them, may overflow.
 _MAX_NUMBER = 1e150
-
-# Largest relative gap of an accepted answer: the exact program's own tolerance.
-_MAX_GAP = 1e-7
 
 
 class Shortcut:
@@ -63,7 +66,7 @@ class Shortcut:
         self._backoff[gain_rows] = policy.backoff
         self._largest = _largest_multipliers(problem, policy, slope, kinds)
         offset = kinds == RowKind.OFFSET
-        self._offset, self._price = np.flatnonzero(offset), problem.price[offset]
+        self._price = problem.price[offset]
         self._clip = np.where(offset, problem.price, np.inf)  # the offset's multipliers; see `QuadraticProgram`
         sense = np.where(soft, SOFT, 0).astype(np.int32)
         sense[self._pins] = EQUAL
@@ -90,38 +93,19 @@ class Shortcut:
                 q[i], net[i] = solved
         net = np.clip(net, -self._clip, self._clip)
         # cost = c + J_cov + ½ q'Hq + f'q + price · |offset|
-        off_target = np.abs(multiply_rows(q, problem.a[self._offset].T) + qp.offset[:, self._offset])
+        plan = problem.read_plan(qp, q)
         cost = qp.constant + self._covariance + dot_rows(q, multiply_rows(0.5 * q, problem.h) + qp.f)
-        cost += dot_rows(off_target, self._price)
+        cost += dot_rows(plan.off_target, self._price)
         # lower = c + D - μ · room/2 - ½ g'H⁻¹g - λ⁺ · above + λ⁻ · below, with g = f + A'(λ⁺ - λ⁻)
         g, plus = qp.f + multiply_rows(net, problem.a), np.maximum(net, 0.0)
         bound = (
             0.5 * dot_rows(multiply_rows(g, self._h_inverse), g) + dot_rows(plus, above) + dot_rows(net - plus, below)
         )
         cost_lower = qp.constant + self._level - bound
-        w, y_now = (
-            multiply_rows(q, problem.z.T) + multiply_rows(qp.p, problem.w.T),
-            qp.p[:, problem.n_p - problem.n_y :],
-        )
-        inputs = problem.inputs(w, y_now)
-        inputs = clip_inputs(inputs.reshape(-1, inputs.shape[2]), part.c_u, part.b_u)[0].reshape(inputs.shape)
-        reference = multiply_rows(w[:, problem.n_v :] + y_now, part.x_eq.T)
         is_optimal: NDArray[np.bool_] = np.all(np.abs(net) <= self._largest, axis=1)
         return [
-            PartAnswer(
-                status=SolveStatus.OPTIMAL,
-                iterations=0,
-                inputs=inputs[i],
-                backoff_x=self._backoff_x,
-                backoff_u=self._backoff_u,
-                reference=reference[i],
-                slack=0.0,
-                offset=float(off_target[i].sum()),
-                terminal_miss=0.0,
-                cost=float(cost[i]),
-                cost_lower=float(cost_lower[i]),
-            )
-            if is_optimal[i] and relative_gap(cost[i], cost_lower[i]) <= _MAX_GAP
+            PartAnswer.proven(plan, i, (self._backoff_x, self._backoff_u), cost[i], cost_lower[i])
+            if is_optimal[i] and relative_gap(cost[i], cost_lower[i]) <= MAX_GAP
             else None
             for i in range(len(x))
         ]
@@ -158,22 +142,31 @@ class MethodAnswer(NamedTuple):
 class _ComponentSolver:
     """Solver of one component: frozen policy first, then the exact program."""
 
-    def __init__(self, design: Design, component: Component) -> None:
+    def __init__(self, design: Design, component: Component, *, sequential: bool) -> None:
         self.exact = PartSolver(design, component)
         problem = MeanProblem(design, self.exact.horizon)
         policy = cheapest_policy(problem, design.max_iterations)
-        # None where there is no frozen policy
-        self._shortcut = None if policy is None else Shortcut(problem, policy, *self.exact.backoffs(policy.theta))
+        self._programs: list[tuple[str, Shortcut | SequentialProgram]] = []  # empty where there is no frozen policy
+        if policy is None:
+            return
+        self._programs.append((FROZEN, Shortcut(problem, policy, *self.exact.backoffs(policy.theta))))
+        program = make_sequential_program(problem, policy, self.exact.backoffs) if sequential else None
+        if program is not None:
+            self._programs.append((SEQUENTIAL, program))
 
     def solve(self, x: Array, target: Array, preview: Preview) -> list[MethodAnswer]:
         """Solve for states (M, n_x) of the whole plant."""
         if not len(x):
             return []
-        answers = [None] * len(x) if self._shortcut is None else self._shortcut.solve(x, target, preview)
+        answers: list[MethodAnswer | None] = [None] * len(x)
+        for method, program in self._programs:
+            left = [i for i, answer in enumerate(answers) if answer is None]
+            if not left:
+                break
+            for i, answer in zip(left, program.solve(x[left], target, preview), strict=True):
+                answers[i] = None if answer is None else MethodAnswer(method, answer)
         return [
-            MethodAnswer(METHOD, self.exact.solve(state, target, preview))
-            if answer is None
-            else MethodAnswer(FROZEN, answer)
+            MethodAnswer(METHOD, self.exact.solve(state, target, preview)) if answer is None else answer
             for state, answer in zip(x, answers, strict=True)
         ]
 
@@ -185,14 +178,22 @@ class ShortcutSolver:
     The same question gives the same bits after any other questions. Not for concurrent use.
     """
 
-    def __init__(self, design: Design) -> None:
+    def __init__(self, design: Design, *, sequential: bool = False) -> None:
         """Build the programs of every component.
+
+        Args:
+            design: Design, with those for late positions.
+            sequential: Answer by SQP what the frozen policy does not. A flight does not: a recording of an earlier
+                version must replay with the same bits.
 
         Raises:
             DesignError: The design cannot be decomposed, or its schedule does not fit its terminal law.
         """
         self._variants = tuple(
-            (variant, tuple(_ComponentSolver(variant, component) for component in decompose(variant)))
+            (
+                variant,
+                tuple(_ComponentSolver(variant, component, sequential=sequential) for component in decompose(variant)),
+            )
             for variant in (design, *design.late)
         )
 
@@ -203,7 +204,7 @@ class ShortcutSolver:
         is raised.
         """
         design, shares = self.solve_components(x[None], target, preview)
-        method = FROZEN if all(share.method == FROZEN for _, (share,) in shares) else METHOD
+        method = max((share.method for _, (share,) in shares), key=_METHODS.index)
         return assemble(design, seq, method, x, [(part, share.answer) for part, (share,) in shares], preview)
 
     def solve_components(
