@@ -93,6 +93,10 @@ class EndedBySignal(SystemExit):
     """The operator's second signal: it ends the process wherever that is, also in code of another package."""
 
 
+class TickOverdueError(BaseException):
+    """A tick that does not end; no handler of another package's errors is meant to catch it."""
+
+
 # What code of other packages may raise, where nothing that it does may end a flight or a campaign.
 RAISED = (Exception, SystemExit, GeneratorExit)
 LONGEST_WORDS = 500  # of what an error says [characters]

@@ -49,6 +49,7 @@ from uavctl.daemon.control_socket import find_control_folder, make_daemon_name, 
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.lock import lock_vehicle
+from uavctl.daemon.tick_limit import limit_ticks
 from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
 
@@ -176,6 +177,7 @@ def fly_daemon(
                     show_live_line(loop, recorder.status, duration_s, config.daemon.tick_s) as feed,
                     run_services(loop, config, path, recorder.status, listener) as service_functions,
                     record_failure(loop),
+                    limit_ticks() as tick_limit,
                 ):
                     is_stop_requested = run_daemon(
                         loop,
@@ -192,6 +194,7 @@ def fly_daemon(
                             *service_functions,
                             *garbage_functions,
                         ),
+                        limit_tick=tick_limit.apply,
                         on_events=feed.events.extend,
                     )
                 if is_stop_requested:
