@@ -77,6 +77,10 @@ class RecordingError(UavctlError):
     """A recording cannot be read, or not without loss."""
 
 
+class OutputError(UavctlError):
+    """Standard output takes nothing."""
+
+
 class VehicleTakenError(UavctlError):
     """Another daemon flies this vehicle, or answers under its name."""
 

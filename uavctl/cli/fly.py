@@ -26,6 +26,7 @@ from uavctl.cli.common import (
     make_key_overrides,
     print_message,
 )
+from uavctl.cli.error_stream import limit_output_wait
 from uavctl.cli.flying import (
     Live,
     LivePort,
@@ -41,7 +42,7 @@ from uavctl.cli.flying import (
 )
 from uavctl.cli.live_line import show_live_line
 from uavctl.cli.services import enable_realtime_process, run_services
-from uavctl.cli.signals import stop_on_signals
+from uavctl.cli.signals import ignore_stopping_signals, stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import LoadedConfig
 from uavctl.config.connections import find_security_warnings
@@ -99,7 +100,8 @@ def fly(
         realtime=realtime,
         view_port=view_port,
     )
-    common.show("fly", summary, lambda: make_summary_table(summary))
+    with limit_output_wait():
+        common.show("fly", summary, lambda: make_summary_table(summary))
     return summary.ending.exit_code
 
 
@@ -152,6 +154,7 @@ def fly_daemon(
         begin_s = time.perf_counter()
         with (
             enable_realtime_process(realtime) as garbage_functions,
+            ignore_stopping_signals(),
             stop_on_signals() as stopped,
             open_links(config, wait_for_server(stopped)) as connections,
         ):
@@ -197,7 +200,7 @@ def fly_daemon(
                         limit_tick=tick_limit.apply,
                         on_events=feed.events.extend,
                     )
-                if is_stop_requested:
+                if is_stop_requested and loop.finished:  # not where the limit of the end broke it off
                     vehicle_lock.update(False)
             finally:
                 ending = loop.ending
