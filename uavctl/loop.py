@@ -30,7 +30,7 @@ from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
 from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
-from uavctl.mavlink.landing import LandingRequest
+from uavctl.mavlink.landing import LandingRequest, LandingTarget
 from uavctl.mavlink.messages import CommandAck, Message, StatusText
 from uavctl.mavlink.relay import Relay
 from uavctl.records import (
@@ -425,6 +425,16 @@ class ControlLoop:
         text = f"{subject}: {_describe_error(error)}; the flight goes on"
         return self.handle_failure(InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.NONE), discard)
 
+    @property
+    def landing_target(self) -> LandingTarget | None:
+        """Vehicle, autopilot and frames of the request to land that a failure now would cause; None if it would not."""
+        is_flown = self._vehicle is not None and self._vehicle.armed
+        return self._landing_request.target if is_flown and self._would_land_on_failure else None
+
+    @property
+    def _would_land_on_failure(self) -> bool:
+        return self._hand_over.lands_on_request and (self._lands_on_failure or self._hand_over.is_ordered_flight)
+
     def send_landing_request(self, at_ns: int, send: Send) -> bool:
         """Send the landing request of a flight whose cycles fail, if it is due; return whether it is pending."""
         self._begin_landing_request(at_ns)
@@ -466,7 +476,7 @@ class ControlLoop:
         return event
 
     def _begin_landing_request(self, at_ns: int) -> None:
-        if self._hand_over.lands_on_request and (self._lands_on_failure or self._hand_over.is_ordered_flight):
+        if self._would_land_on_failure:
             self._landing_request.begin(at_ns)
 
     def _send_landing_request(self, at_ns: int, send: Send) -> None:

@@ -65,6 +65,12 @@ class PeerConnection:
         self.arrived: list[tuple[bytes, int]] = []
         self.refused: Counter[str] = Counter()
 
+    def find_sender(self) -> tuple[int, None]:
+        return -1, None
+
+    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
+        return frame
+
     def fileno(self) -> int:
         return -1
 

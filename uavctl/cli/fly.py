@@ -37,6 +37,7 @@ from uavctl.cli.flying import (
     open_viewers,
     order_stand_by,
     print_ending,
+    print_warning,
     record_failure,
     wait_for_server,
 )
@@ -49,10 +50,11 @@ from uavctl.config.connections import find_security_warnings
 from uavctl.daemon.control_socket import find_control_folder, make_daemon_name, open_listener
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
+from uavctl.daemon.landing_guard import guard_landing
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.daemon.tick_limit import limit_ticks
 from uavctl.io.signed_connection import open_links
-from uavctl.loop import ControlLoop
+from uavctl.loop import VEHICLE, ControlLoop
 
 
 def fly(
@@ -181,6 +183,7 @@ def fly_daemon(
                     run_services(loop, config, path, recorder.status, listener) as service_functions,
                     record_failure(loop),
                     limit_ticks() as tick_limit,
+                    guard_landing(loop, config, connections[VEHICLE], print_warning) as guard_functions,
                 ):
                     is_stop_requested = run_daemon(
                         loop,
@@ -191,6 +194,7 @@ def fly_daemon(
                         stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
                         engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
                         after_tick=(
+                            *guard_functions,
                             feed.after_tick,
                             lambda *_: vehicle_lock.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),

@@ -131,6 +131,11 @@ def open_viewers(live_port: int | None = None) -> Iterator[DerivedTopics]:
         live.close()
 
 
+def print_warning(text: str) -> None:
+    """Print a warning."""
+    print_message(label_text("warning", text))
+
+
 def report_dead_view(reason: str) -> None:
     """Print that the process of a live view has ended."""
     print_message(label_text("warning", f"the live view has ended ({reason}); the flight goes on without it"))
