@@ -137,8 +137,8 @@ def print_warning(text: str) -> None:
 
 
 def report_dead_view(reason: str) -> None:
-    """Print that the process of a live view has ended."""
-    print_message(label_text("warning", f"the live view has ended ({reason}); the flight goes on without it"))
+    """Print that the process of a live view has ended, and what follows."""
+    print_message(label_text("warning", f"the live view has ended: {reason}; the flight goes on"))
 
 
 def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
