@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -308,6 +308,7 @@ def use_virtual_time(rig: EndingRig) -> Iterator[None]:
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", DiskRecorder)
+        patch.setattr(fly_cmd, "guard_landing", lambda *_: nullcontext(()))
         patch.setattr("uavctl.cli.check.check_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.services.HealthMonitor", Watched)
         patch.setattr(Notifier, "send_status", lambda _, text: rig.notified_texts.append(text))
