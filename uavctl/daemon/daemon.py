@@ -7,8 +7,8 @@ An error ends no flight without a landing request:
 2. In what gives the orders of the flight: the flight ends as if that were asked for.
 3. In a cycle: no setpoint any more; the next cycles ask for landing and pass positions on.
 4. In several cycles in a row: a landing request of its own is sent until it is answered.
-A tick that does not end is an error of its cycle (`uavctl.daemon.tick_limit`). If the process dies, another one asks for
-landing (`uavctl.daemon.landing_host`).
+A tick that does not end is an error of its cycle (`uavctl.daemon.tick_limit`). If the process dies, another one asks
+for landing (`uavctl.daemon.landing_host`).
 """
 
 from __future__ import annotations
