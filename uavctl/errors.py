@@ -77,6 +77,10 @@ class RecordingError(UavctlError):
     """A recording cannot be read, or not without loss."""
 
 
+class OutputError(UavctlError):
+    """Standard output takes nothing."""
+
+
 class VehicleTakenError(UavctlError):
     """Another daemon flies this vehicle, or answers under its name."""
 
@@ -91,6 +95,10 @@ class KeyFileError(UsageError):
 
 class EndedBySignal(SystemExit):
     """The operator's second signal: it ends the process wherever that is, also in code of another package."""
+
+
+class TickOverdueError(BaseException):
+    """A tick that does not end; no handler of another package's errors is meant to catch it."""
 
 
 # What code of other packages may raise, where nothing that it does may end a flight or a campaign.

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from uavctl.account import FlightAccount
 from uavctl.cause import Cause
 from uavctl.config import Config
-from uavctl.errors import in_words
+from uavctl.errors import TickOverdueError, in_words
 from uavctl.event_codes import EventCode
 from uavctl.flight.controller import Controller
 from uavctl.flight.supervise import distrusts_positions
@@ -30,7 +30,7 @@ from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
 from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
-from uavctl.mavlink.landing import LandingRequest
+from uavctl.mavlink.landing import LandingRequest, LandingTarget
 from uavctl.mavlink.messages import CommandAck, Message, StatusText
 from uavctl.mavlink.relay import Relay
 from uavctl.records import (
@@ -283,12 +283,15 @@ class ControlLoop:
             self._put("/uavctl/event", at_ns, event)
         return tuple([event for event in events if event.code in CONSOLE_CODES])
 
-    def tick(self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False) -> Ticked:
+    def tick(
+        self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False, core_error: str = ""
+    ) -> Ticked:
         """Run the control tick of grid time `at_ns`.
 
         Args:
             send: Called with the bytes to send, each as soon as it is known: heartbeats and TIMESYNC before the
                 decision, so that a solve does not delay a round trip.
+            core_error: Recorded error of the core in this tick: it fails with that, and is not run.
         """
         inputs = self._gather_inputs(tick, at_ns, missed_ticks, stop)
         if stop:
@@ -298,7 +301,7 @@ class ControlLoop:
                 send(self._record_outgoing(name, data, at_ns))
         notices: list[Event] = []
         begin_ns = self._stopwatch()
-        output = self._run_core(inputs, notices)
+        output = self._run_core(inputs, notices, core_error)
         step_ns = self._stopwatch() - begin_ns
         self._decision = output.decision
         self._record_output(output, at_ns)
@@ -374,15 +377,17 @@ class ControlLoop:
             send(datagram)
         return answers
 
-    def _run_core(self, inputs: StepInput, notices: list[Event]) -> TickOutput:
+    def _run_core(self, inputs: StepInput, notices: list[Event], core_error: str) -> TickOutput:
         """Run the core for a tick. A core that has failed is not run again; the vehicle that it flew is to land."""
+        if core_error:
+            notices.append(self._fail_core(core_error, inputs.at_ns))
         if not self.account.control_error:
             try:
                 self._state, output = run_tick(
                     self._state, inputs, self._controller, is_climbing_or_landing=self._hand_over.has_begun
                 )
-            except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
-                notices.append(self._fail(_describe_error(error), inputs.at_ns))
+            except (Exception, TickOverdueError) as error:  # noqa: BLE001 the vehicle may fly by relayed positions
+                notices.append(self._fail_core(_describe_error(error), inputs.at_ns))
             else:
                 return output
         return self._make_failed_output(inputs, land=self._is_landing_due)
@@ -409,7 +414,7 @@ class ControlLoop:
         )
         return TickOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
-    def fail(self, error: Exception, at_ns: int) -> Event:
+    def fail(self, error: BaseException, at_ns: int) -> Event:
         """Note an error of a whole cycle, and return its event: no setpoint is sent, landing is asked for."""
         return self.handle_failure(
             InternalError(at_ns=at_ns, text=_describe_error(error), effect=InternalErrorEffect.CONTROL), discard
@@ -419,6 +424,16 @@ class ControlLoop:
         """Note an error of what the flight does not need; return the event."""
         text = f"{subject}: {_describe_error(error)}; the flight goes on"
         return self.handle_failure(InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.NONE), discard)
+
+    @property
+    def landing_target(self) -> LandingTarget | None:
+        """Vehicle, autopilot and frames of the request to land that a failure now would cause; None if it would not."""
+        is_flown = self._vehicle is not None and self._vehicle.armed
+        return self._landing_request.target if is_flown and self._would_land_on_failure else None
+
+    @property
+    def _would_land_on_failure(self) -> bool:
+        return self._hand_over.lands_on_request and (self._lands_on_failure or self._hand_over.is_ordered_flight)
 
     def send_landing_request(self, at_ns: int, send: Send) -> bool:
         """Send the landing request of a flight whose cycles fail, if it is due; return whether it is pending."""
@@ -438,6 +453,11 @@ class ControlLoop:
             self._send_landing_request(failure.at_ns, send)
         return event
 
+    def _fail_core(self, text: str, at_ns: int) -> Event:
+        """Record an error of the core, which need not come again in a replay: no memory, or no end of a tick."""
+        self._put("/uavctl/failure", at_ns, InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.TICK))
+        return self._fail(text, at_ns)
+
     def _fail(self, text: str, at_ns: int) -> Event:
         self._is_landing_due = self._lands_on_failure or self._hand_over.is_ordered_flight
         self.account.control_error = self.account.control_error or text
@@ -456,7 +476,7 @@ class ControlLoop:
         return event
 
     def _begin_landing_request(self, at_ns: int) -> None:
-        if self._hand_over.lands_on_request and (self._lands_on_failure or self._hand_over.is_ordered_flight):
+        if self._would_land_on_failure:
             self._landing_request.begin(at_ns)
 
     def _send_landing_request(self, at_ns: int, send: Send) -> None:
@@ -671,7 +691,7 @@ class ControlLoop:
                 self._put("/uavctl/relay", at_ns, relay)
 
 
-def _describe_error(error: Exception) -> str:
+def _describe_error(error: BaseException) -> str:
     """Return an error in words, with its place in the code."""
     last = next(reversed(extract_tb(error.__traceback__)), None)
     where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"

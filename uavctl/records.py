@@ -297,10 +297,11 @@ class InternalErrorEffect(StrEnum):
     NONE = "none"  # the flight goes on
     CONTROL = "control"  # no setpoint any more; the hand-over is to ask for landing
     LANDING = "landing"  # a landing request is sent without the hand-over
+    TICK = "tick"  # as CONTROL, from the controller in the tick before this record
 
 
 class InternalError(Record, frozen=True, kw_only=True):
-    """Error outside the control loop, as the loop is told; an input, for a replay."""
+    """Error of the flight's process, as the loop is told or meets it; an input, for a replay."""
 
     at_ns: int
     text: str

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 
 _LOCAL_HOST = re.compile(r"(localhost|127\.0\.0\.1)(:[0-9]{1,5})?", re.IGNORECASE)
+_OWN_SITE = ("same-origin", "none")  # values of Sec-Fetch-Site: a page of ours, or a user's own request
 _HEADER_NAME = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
 
 
@@ -57,7 +58,8 @@ def check_request(request: Request, token: str) -> None:
     """Check that a request only reads, and comes from this machine and not from the page of another site.
 
     Host is the name by which the browser knows the server: another site may let its own name lead to this machine.
-    Origin is the site whose page asks; programs that are no browsers send none.
+    Origin is the site whose page asks; programs that are no browsers send none. A browser sends none either where the
+    page cannot read the answer, as of a picture; such a page could take all places. Sec-Fetch-Site tells it.
 
     Args:
         token: A WebSocket with this path may be opened by the page of any site, as its user has entered the token.
@@ -73,7 +75,9 @@ def check_request(request: Request, token: str) -> None:
     if request.method != "GET":
         raise RequestRefusedError(HTTPStatus.METHOD_NOT_ALLOWED, "nothing can be written here; GET alone is allowed")
     origin = request.headers.get("origin")
-    is_same_site = origin is None or origin.lower() == f"http://{host.lower()}"
+    is_same_site = (origin is None or origin.lower() == f"http://{host.lower()}") and (
+        request.headers.get("sec-fetch-site", "none") in _OWN_SITE
+    )
     has_token = request.asks_for_websocket and hmac.compare_digest(request.path.encode(), f"/{token}".encode())
     if not is_same_site and not has_token:
         raise RequestRefusedError(

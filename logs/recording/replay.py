@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -35,6 +35,7 @@ from uavctl.records import (
     Decision,
     Event,
     InternalError,
+    InternalErrorEffect,
     Plan,
     PositionSample,
     Record,
@@ -47,7 +48,10 @@ from uavctl.smpc.plant import AXES, Plant
 
 DECISION = "/uavctl/decision"
 PLAN = "/uavctl/plan"
+STEP_INPUT = "/uavctl/step_input"
+FAILURE = "/uavctl/failure"
 NOTHING = "nothing"
+Message = tuple[str, int, Record | bytes]  # topic, log time [ns], record or the bytes that it is recorded as
 Leaf = tuple[str, object, object]  # path, recorded, replayed
 
 # What the records of a tick say one after the other: those before the first one that differs are the same.
@@ -450,7 +454,7 @@ class _Findings:
 
 
 def replay(
-    messages: Iterable[tuple[str, int, Record | bytes]],
+    messages: Iterable[Message],
     make_loop: Callable[[Sink], ControlLoop],
     tolerance: float = 0.0,
     *,
@@ -470,7 +474,7 @@ def replay(
     produced = _Produced()
     loop = make_loop(produced)
     findings = _Findings(FieldNames(loop.plant), tolerance, ignored)
-    for topic, at_ns, message in messages:
+    for (topic, at_ns, message), core_error in _find_core_errors(messages):
         record = _decoded(topic, at_ns, message) if _is_input(topic) or not isinstance(message, bytes) else None
         if isinstance(record, StepInput):
             # What the last tick said must have been read by now. Only a torn file's last tick may lack some.
@@ -479,12 +483,12 @@ def replay(
             for command in record.commands:
                 loop.order(command)
             loop.answered(record.answered_ns)
-            loop.tick(record.tick, record.at_ns, discard, record.missed_ticks, record.stop)
+            loop.tick(record.tick, record.at_ns, discard, record.missed_ticks, record.stop, core_error)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):
             loop.refused(record.link, record.counts, record.at_ns)
-        elif isinstance(record, InternalError):
+        elif isinstance(record, InternalError) and record.effect is not InternalErrorEffect.TICK:
             loop.handle_failure(record, discard)
         elif isinstance(record, RecorderNote):
             findings.dropped = record.dropped
@@ -502,6 +506,27 @@ def replay(
     if finished:
         _add_missing(findings, produced)
     return findings.result(finished=finished)
+
+
+def _find_core_errors(messages: Iterable[Message]) -> Iterator[tuple[Message, str]]:
+    """Yield the messages, each step input with the error that the core met in its tick; empty without one."""
+    of_tick: list[Message] = []
+    for message in messages:
+        if message[0] == STEP_INPUT and of_tick:
+            yield from _add_core_error(of_tick)
+            of_tick = []
+        of_tick.append(message)
+    yield from _add_core_error(of_tick)
+
+
+def _add_core_error(of_tick: Sequence[Message]) -> Iterator[tuple[Message, str]]:
+    errors = [_decoded(*message) for message in of_tick if message[0] == FAILURE]
+    core_errors = [
+        record.text
+        for record in errors
+        if isinstance(record, InternalError) and record.effect is InternalErrorEffect.TICK
+    ]
+    return ((message, "".join(core_errors[:1])) for message in of_tick)
 
 
 def _decoded(topic: str, at_ns: int, message: Record | bytes) -> Record:

@@ -171,6 +171,12 @@ class Wire:
 
     has_known_sender, has_unread = True, False
 
+    def find_sender(self) -> tuple[int, None]:
+        return -1, None
+
+    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
+        return frame
+
     def fileno(self) -> int:
         return -1
 

@@ -159,13 +159,15 @@ class Stalled(DaemonRig):
         if in_step:
             self._tick, self.loop.tick = self.loop.tick, self.stalling_tick  # type: ignore[method-assign]
 
-    def stalling_tick(self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False) -> Ticked:
+    def stalling_tick(
+        self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False, core_error: str = ""
+    ) -> Ticked:
         def late(message: Outgoing) -> None:
             if not self.woke_ns and at_ns >= self.silent_from_ns and len(message.data) > 50:
                 self.stall()
             send(message)
 
-        return self._tick(tick, at_ns, late, missed_ticks, stop)
+        return self._tick(tick, at_ns, late, missed_ticks, stop, core_error)
 
     def stall(self) -> None:
         begun_ns = self.now_ns

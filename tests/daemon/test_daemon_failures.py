@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from daemon_rig import SECOND, DaemonRig
@@ -11,8 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
 from logs.recording.replay import replay
-from uavctl.errors import UavctlError
+from uavctl.errors import TickOverdueError, UavctlError
 from uavctl.event_codes import EventCode
+from uavctl.flight.tick import tick as run_tick
 from uavctl.mavlink.connection import MavlinkConnection, ReceiveResult
 from uavctl.records import ControlMode, Datagram, Decision, Event, Ticked
 
@@ -146,6 +148,27 @@ def test_88_a_tick_that_fails_ends_control_with_a_landing(autopilot: str, monkey
     assert has_landed(rig, autopilot) and not count_setpoints_after(rig, FAIL_S)
     assert count_codes(rig, EventCode.CONTROL_FAILED) == 1
     assert not rig.loop.ending.as_ordered
+
+
+@pytest.mark.fault(102)
+@pytest.mark.parametrize("error", [TickOverdueError, MemoryError])
+@BOTH
+def test_102_a_core_without_an_end_ends_control_with_a_landing_and_is_not_run_in_a_replay(
+    autopilot: str, error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig(autopilot)
+
+    def fail_core(*given: Any, **more: Any) -> Any:
+        if rig.now_ns >= FAIL_S * SECOND:
+            raise error
+        return run_tick(*given, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("uavctl.loop.run_tick", fail_core)
+        rig.fly()
+    assert has_landed(rig, autopilot) and not count_setpoints_after(rig, FAIL_S)
+    assert count_codes(rig, EventCode.CONTROL_FAILED) == 1
+    check_replay(rig)  # with a core that does not fail
 
 
 @pytest.mark.fault(88)

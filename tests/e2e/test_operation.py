@@ -77,8 +77,8 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
 
 @pytest.mark.slow
 @pytest.mark.fault(31)
-def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
-    with end_process(air.fly("f")) as process:
+def test_after_sigkill_without_a_landing_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
+    with end_process(air.fly("f", "--set", "fallback.land=false")) as process:
         wait_for_flight(air)
         # What is on the disk once stays there: the last second at most may be lost.
         wait_until(

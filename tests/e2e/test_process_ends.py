@@ -180,6 +180,19 @@ def test_a_new_port_of_the_vehicle_without_a_descriptor_left_does_not_end_the_fl
     check_end(air, capsys)
 
 
+@pytest.mark.slow
+@pytest.mark.fault(103)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("air", AUTOPILOTS, indirect=True)
+def test_a_process_that_dies_or_stands_still_leaves_a_request_to_land(air: Scene, number: signal.Signals) -> None:
+    with end_process(air.fly("f")) as process:
+        wait_for_flight(air)
+        process.send_signal(number)
+        process.wait(LIMIT_S)
+    assert process.returncode == -signal.SIGKILL
+    wait_until(lambda: air.has_landed, "the vehicle lands")
+
+
 FAILING = """
 import os, select, threading
 plain = select.select

@@ -29,7 +29,7 @@ from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
 from uavctl.io.camera import COUNTS, READY, BodyPose, Echo
 from uavctl.io.camera_host import OVERRUN, CameraHost
-from uavctl.io.camera_process import MAX_RESTARTS
+from uavctl.io.helper_process import MAX_RESTARTS
 from uavctl.io.natnet import ECHO
 from uavctl.io.signed_connection import open_links
 from uavctl.io.sources import open_source

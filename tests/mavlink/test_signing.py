@@ -51,6 +51,18 @@ def test_stamps_are_ten_microseconds_since_2015_and_always_grow() -> None:
     assert stamp_of(signing.sign(frame, 0)) == burst[-1] + 1  # no clock takes them back
 
 
+@pytest.mark.fault(103)
+def test_103_a_frame_that_is_signed_ahead_is_new_until_that_time_and_changes_no_other_stamp() -> None:
+    receiver = mavlink.MAVLink(None)
+    receiver.signing.secret_key = KEY
+    signing, peer = make_signing(), Peer(245, 25)
+    ahead = signing.sign_ahead(peer.heartbeat(), 2 * 10**9)
+    stamps = [stamp_of(signing.sign(peer.heartbeat(), n * 10**9)) for n in range(4)]
+    assert [stamp - stamps[0] for stamp in stamps] == [n * SECOND for n in range(4)]
+    assert stamp_of(ahead) == stamps[2]
+    assert receiver.parse_buffer(ahead)
+
+
 def test_stamps_never_outgrow_their_48_bits_and_never_fall_below_zero() -> None:
     frame = Peer().heartbeat()
     full = FrameSigner(SigningKey(KEY), 7, SigningTimestamps(newest=2**48 - 2), OFFSET_NS)

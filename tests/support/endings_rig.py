@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,12 @@ class PeerConnection:
         self._rig, self._name = rig, name
         self.arrived: list[tuple[bytes, int]] = []
         self.refused: Counter[str] = Counter()
+
+    def find_sender(self) -> tuple[int, None]:
+        return -1, None
+
+    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
+        return frame
 
     def fileno(self) -> int:
         return -1
@@ -302,6 +308,7 @@ def use_virtual_time(rig: EndingRig) -> Iterator[None]:
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", DiskRecorder)
+        patch.setattr(fly_cmd, "guard_landing", lambda *_: nullcontext(()))
         patch.setattr("uavctl.cli.check.check_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.services.HealthMonitor", Watched)
         patch.setattr(Notifier, "send_status", lambda _, text: rig.notified_texts.append(text))

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from traceback import format_exc
 from typing import NoReturn
 
-from uavctl.cli.error_stream import finish_streams, prepare_streams
+from uavctl.cli.error_stream import discard_output, finish_streams, prepare_streams
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 INTERRUPTED = 130  # exit code of a shell for a command that SIGINT ended
@@ -36,6 +36,9 @@ def main() -> None:
         finish_streams()
         # At its end the interpreter would kill itself by the signal, if that came while a dataclass was made.
         os._exit(INTERRUPTED)
+    except BrokenPipeError:  # who read standard output has gone
+        discard_output()
+        code = 1
     except Exception:  # noqa: BLE001 an error that nobody expected
         sys.stderr.write(format_exc())
         code = 1

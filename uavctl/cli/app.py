@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
+from traceback import format_exc
 from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
@@ -19,9 +20,10 @@ from uavctl.cli.common import (
     reserve_stdout,
     write_document,
 )
+from uavctl.cli.error_stream import limit_output_wait
 from uavctl.cli.usage import describe_unknown_command, describe_unknown_option, explain_error, format_example
 from uavctl.config.load import find_nearest
-from uavctl.errors import ConfigError, UavctlError, UsageError
+from uavctl.errors import ConfigError, OutputError, UavctlError, UsageError, in_words
 
 _HELP = """Stochastic model predictive flight control shaped by the age of information, over MAVLink.
 
@@ -120,6 +122,9 @@ def run(arguments: Sequence[str], on_imported: Callable[[], None] = lambda: None
     except OSError as error:  # an error that no command handles: a full disk, a name that is too long
         text = f"{error.filename or 'system'}: {error.strerror or error}"
         return _report_error(UavctlError(text), [text], arguments)
+    except Exception as error:  # noqa: BLE001 one that nobody expected
+        sys.stderr.write(format_exc())
+        return _report_error(UavctlError(in_words(error)), [in_words(error)], arguments)
     return result if isinstance(result, int) else 0
 
 
@@ -145,7 +150,8 @@ def _report_error(error: UavctlError, problems: Sequence[str], arguments: Sequen
     print_message(label_text("error", "\n".join(lines), "bold red"))
     if "--json" in arguments:  # also for an unknown argument: a program reads it
         document = {"type": type(error).__name__, "message": "\n".join(problems), "exit_code": error.exit_code}
-        write_document("error", document)
+        with suppress(OutputError), limit_output_wait():
+            write_document("error", document)
     return error.exit_code
 
 

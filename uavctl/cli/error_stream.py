@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import sys
 import threading
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import TextIOBase
+from types import FrameType
+
+from uavctl.errors import OutputError
 
 MAX_WAITING_BYTES = 2**20  # of text that nobody reads
 END_LIMIT_S = 1.0  # for the last text at the end of the process
 _POLL_S = 1.0
+OUTPUT_LIMIT_S = 5.0  # for the summary at the end of a flight
 
 
 class BackgroundStream(TextIOBase):
@@ -132,6 +138,38 @@ def prepare_streams() -> None:
         reconfigure(errors="backslashreplace")
     encoding = "utf-8" if sys.stderr is None else sys.stderr.encoding
     sys.stderr = BackgroundStream(2, encoding)
+
+
+@contextmanager
+def limit_output_wait() -> Iterator[None]:
+    """Let this block, which writes to standard output, wait for a reader for a limited time. Main thread only.
+
+    Raises:
+        OutputError: Nobody reads standard output; all further output is discarded.
+    """
+
+    def end_wait(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        raise TimeoutError
+
+    previous = signal.signal(signal.SIGALRM, end_wait)
+    signal.setitimer(signal.ITIMER_REAL, OUTPUT_LIMIT_S)
+    try:
+        yield
+    except (BrokenPipeError, TimeoutError) as error:
+        discard_output()
+        raise OutputError("standard output: nobody reads it") from error
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL if previous is None else previous)
+
+
+def discard_output() -> None:
+    """Discard what standard output holds, and all that is written to it from now on."""
+    with suppress(OSError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.close(null)
 
 
 def finish_streams() -> None:

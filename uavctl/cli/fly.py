@@ -26,6 +26,7 @@ from uavctl.cli.common import (
     make_key_overrides,
     print_message,
 )
+from uavctl.cli.error_stream import limit_output_wait
 from uavctl.cli.flying import (
     Live,
     LivePort,
@@ -36,21 +37,24 @@ from uavctl.cli.flying import (
     open_viewers,
     order_stand_by,
     print_ending,
+    print_warning,
     record_failure,
     wait_for_server,
 )
 from uavctl.cli.live_line import show_live_line
 from uavctl.cli.services import enable_realtime_process, run_services
-from uavctl.cli.signals import stop_on_signals
+from uavctl.cli.signals import ignore_stopping_signals, stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import LoadedConfig
 from uavctl.config.connections import find_security_warnings
 from uavctl.daemon.control_socket import find_control_folder, make_daemon_name, open_listener
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
+from uavctl.daemon.landing_guard import guard_landing
 from uavctl.daemon.lock import lock_vehicle
+from uavctl.daemon.tick_limit import limit_ticks
 from uavctl.io.signed_connection import open_links
-from uavctl.loop import ControlLoop
+from uavctl.loop import VEHICLE, ControlLoop
 
 
 def fly(
@@ -98,7 +102,8 @@ def fly(
         realtime=realtime,
         view_port=view_port,
     )
-    common.show("fly", summary, lambda: make_summary_table(summary))
+    with limit_output_wait():
+        common.show("fly", summary, lambda: make_summary_table(summary))
     return summary.ending.exit_code
 
 
@@ -151,6 +156,7 @@ def fly_daemon(
         begin_s = time.perf_counter()
         with (
             enable_realtime_process(realtime) as garbage_functions,
+            ignore_stopping_signals(),
             stop_on_signals() as stopped,
             open_links(config, wait_for_server(stopped)) as connections,
         ):
@@ -176,6 +182,8 @@ def fly_daemon(
                     show_live_line(loop, recorder.status, duration_s, config.daemon.tick_s) as feed,
                     run_services(loop, config, path, recorder.status, listener) as service_functions,
                     record_failure(loop),
+                    limit_ticks() as tick_limit,
+                    guard_landing(loop, config, connections[VEHICLE], print_warning) as guard_functions,
                 ):
                     is_stop_requested = run_daemon(
                         loop,
@@ -186,15 +194,17 @@ def fly_daemon(
                         stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
                         engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
                         after_tick=(
+                            *guard_functions,
                             feed.after_tick,
                             lambda *_: vehicle_lock.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
                             *service_functions,
                             *garbage_functions,
                         ),
+                        limit_tick=tick_limit.apply,
                         on_events=feed.events.extend,
                     )
-                if is_stop_requested:
+                if is_stop_requested and loop.finished:  # not where the limit of the end broke it off
                     vehicle_lock.update(False)
             finally:
                 ending = loop.ending

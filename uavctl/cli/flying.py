@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from traceback import format_exc
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -23,7 +24,7 @@ from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, label_text, print_message
 from uavctl.cli.signals import SIGNAL_EXIT_BASE
 from uavctl.daemon.engagement import make_goto_keys
-from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError, in_words
+from uavctl.errors import ConnectionClosedError, RecordingError, TickOverdueError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, Ending, Order
 
@@ -130,9 +131,14 @@ def open_viewers(live_port: int | None = None) -> Iterator[DerivedTopics]:
         live.close()
 
 
+def print_warning(text: str) -> None:
+    """Print a warning."""
+    print_message(label_text("warning", text))
+
+
 def report_dead_view(reason: str) -> None:
-    """Print that the process of a live view has ended."""
-    print_message(label_text("warning", f"the live view has ended ({reason}); the flight goes on without it"))
+    """Print that the process of a live view has ended, and what follows."""
+    print_message(label_text("warning", f"the live view has ended: {reason}; the flight goes on"))
 
 
 def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
@@ -192,7 +198,7 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
 
 @contextmanager
 def record_failure(loop: ControlLoop) -> Iterator[None]:
-    """Record an error that ends a flight. A lost link is not raised: the ending reports it."""
+    """Record an error that ends a flight. A lost link, and an unexpected error, are not raised: the ending has them."""
     try:
         yield
     except ConnectionClosedError:
@@ -200,9 +206,12 @@ def record_failure(loop: ControlLoop) -> Iterator[None]:
     except SystemExit as error:
         loop.account.note_signal(int(error.code or 0) - SIGNAL_EXIT_BASE)
         raise
-    except Exception as error:
+    except UavctlError as error:
         loop.account.control_error = in_words(error)
         raise
+    except (Exception, TickOverdueError) as error:  # noqa: BLE001 the flight is over, and its ending says how
+        loop.account.control_error = in_words(error)
+        sys.stderr.write(format_exc())
 
 
 SERVER_RETRY_S = 1.0

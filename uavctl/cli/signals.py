@@ -33,6 +33,8 @@ _EXCLUDED = frozenset(
         signal.SIGABRT,
     }
 )
+# Signals of a terminal that stop a process; a stopped flight would send nothing, and hear no pilot.
+_STOPPING = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
 END_LIMIT_S = 10  # from the second signal to the end of the process; the recording closes within 5 s
 
 Handler = Callable[[int, FrameType | None], None]
@@ -47,6 +49,17 @@ def handle_end_signals(handler: Handler) -> Iterator[None]:
         if number in DELIBERATE or signal.getsignal(number) is signal.SIG_DFL
     ]
     previous = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, signal.SIG_DFL if old is None else old)
+
+
+@contextmanager
+def ignore_stopping_signals() -> Iterator[None]:
+    """Ignore Ctrl-Z, and what stops a process in the background that reads or writes its terminal."""
+    previous = {number: signal.signal(number, signal.SIG_IGN) for number in _STOPPING}
     try:
         yield
     finally:

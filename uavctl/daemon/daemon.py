@@ -7,6 +7,8 @@ An error ends no flight without a landing request:
 2. In what gives the orders of the flight: the flight ends as if that were asked for.
 3. In a cycle: no setpoint any more; the next cycles ask for landing and pass positions on.
 4. In several cycles in a row: a landing request of its own is sent until it is answered.
+A tick that does not end is an error of its cycle (`uavctl.daemon.tick_limit`). If the process dies, another one asks
+for landing (`uavctl.daemon.landing_host`).
 """
 
 from __future__ import annotations
@@ -14,14 +16,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 
 from msgspec.structs import replace
 
 from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
 from uavctl.clock import Ticker, monotonic_ns
-from uavctl.errors import ConnectionClosedError, UavctlError
+from uavctl.errors import ConnectionClosedError, TickOverdueError, UavctlError
 from uavctl.event_codes import EventCode
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
@@ -53,6 +55,7 @@ def fly(
     stop_limit_s: float,
     engagement: AfterTick = lambda *_: None,
     after_tick: Sequence[AfterTick] = (),
+    limit_tick: Callable[[], AbstractContextManager[None]] = nullcontext,
     on_events: Callable[[tuple[Event, ...]], None] = lambda _: None,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
@@ -67,6 +70,7 @@ def fly(
             positions; 0 ends without one.
         engagement: called after each tick; gives the orders of the flight. The hand-over begins if it raises.
         after_tick: services, called in this order after each tick; their errors are reported.
+        limit_tick: context of each tick; interrupts one that does not end.
         on_events: called with the events for people; must not wait.
         wait_for: sleeps until a deadline or the first arrival; returns the names of connections to read.
         now: the clock [ns].
@@ -80,12 +84,12 @@ def fly(
     """
     flight = _Flight(loop, connections, ticker, on_events, wait_for, now)
     flight.stop_requested, flight.duration_s, flight.stop_limit_s = stop_requested, duration_s, stop_limit_s
-    flight.engagement, flight.services = engagement, after_tick
+    flight.engagement, flight.services, flight.limit_tick = engagement, after_tick, limit_tick
     try:
         return flight.run()
     except ConnectionClosedError:
         raise
-    except Exception:
+    except (Exception, TickOverdueError):
         flight.request_landing()
         raise
     finally:
@@ -100,6 +104,7 @@ class _Flight:
     stop_limit_s: float
     engagement: AfterTick
     services: Sequence[AfterTick]
+    limit_tick: Callable[[], AbstractContextManager[None]]
 
     def __init__(
         self,
@@ -131,7 +136,7 @@ class _Flight:
                 self._run_cycle()
             except ConnectionClosedError:
                 raise
-            except Exception as error:
+            except (Exception, TickOverdueError) as error:
                 self._reserve = bytearray()
                 self._failed_cycles += 1
                 event = self._loop.fail(error, self._now())
@@ -185,7 +190,8 @@ class _Flight:
             self._is_over = True
             return
         self._withheld = 0
-        ticked = loop.tick(due.tick, due.at_ns, self._send, due.missed, stop=self._stop_ns is not None)
+        with self.limit_tick():
+            ticked = loop.tick(due.tick, due.at_ns, self._send, due.missed, stop=self._stop_ns is not None)
         lateness_ns, send_ns = started_ns - due.at_ns, self._now() - due.at_ns
         self._follow_engagement(ticked, lateness_ns)
         bookkeeping: tuple[AfterTick, ...] = (

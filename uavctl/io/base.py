@@ -85,6 +85,14 @@ class Connection(Protocol):
         """Send, or drop and count; never blocks, never raises."""
         ...
 
+    def find_sender(self) -> tuple[int, Address | None]:
+        """File descriptor by which `send` sends, and the address if it is not connected; -1 if there is none."""
+        ...
+
+    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
+        """Return the bytes that another process may send for a frame, at least so much later."""
+        ...
+
     def close(self) -> None:
         """Release the socket or port."""
         ...
@@ -139,6 +147,15 @@ class BaseConnection(ABC):
     def count_lost(self) -> int:
         """See `Connection`."""
         return 0
+
+    def find_sender(self) -> tuple[int, Address | None]:
+        """See `Connection`."""
+        return self.fileno(), None
+
+    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
+        """See `Connection`."""
+        del ahead_ns
+        return frame
 
     def select_peer(self, index: int) -> None:
         """See `Connection`."""

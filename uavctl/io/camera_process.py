@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -18,13 +17,12 @@ from uavctl.io.admission import AdmissionRules, AllowList, RateLimiter
 from uavctl.io.base import BaseConnection, Connection
 from uavctl.io.camera import ANSWER_S, COUNTS, FAILED, LARGEST, READY, REFUSED, UNREACHABLE
 from uavctl.io.camera_url import parse_camera_url
+from uavctl.io.helper_process import MAX_RESTARTS, HelperProcess
 
 _MAVLINK = (0xFD, 0xFE)
 _START_S = 60.0  # for the interpreter of the process, on a busy computer
-_END_S = 2.0
 _EXIT_CODE_S = 0.02  # for the exit code of a process that has closed its end
 PROCESS_ENDED = f"{EventCode.PROCESS_ENDED}: "  # begin of a reason of a loss; its cause follows
-MAX_RESTARTS = 3  # of a process that ends while it is needed
 
 
 class CameraProcessConnection(BaseConnection):
@@ -64,23 +62,8 @@ class CameraProcessConnection(BaseConnection):
         Raises:
             OSError: The system does not allow that now.
         """
-        own_socket, peer_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with peer_socket:
-            number = peer_socket.fileno()
-            command = [sys.executable, "-P", "-m", "uavctl.io.camera_host", str(number), *self._arguments]
-            try:
-                self._process = subprocess.Popen(
-                    command,
-                    pass_fds=(number,),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,  # a console that nobody reads would hold it up
-                    start_new_session=True,  # an interrupt is for the daemon; this process ends with the pipe
-                )
-            except OSError:
-                own_socket.close()
-                raise
-        self._socket = own_socket
+        self._helper = HelperProcess("uavctl.io.camera_host", self._arguments)
+        self._socket, self._process = self._helper.socket, self._helper.process
 
     def wait_until_ready(self) -> None:
         """Wait, for a bounded time, until the cameras have answered and know the body.
@@ -124,12 +107,7 @@ class CameraProcessConnection(BaseConnection):
     def close(self) -> None:
         """See `Connection`; the process ends."""
         self.closed = True
-        self._socket.close()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._helper.close()
 
     def _read(self) -> bytes | None:
         data = self._socket.recv(LARGEST)

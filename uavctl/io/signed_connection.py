@@ -13,7 +13,7 @@ from uavctl.clock import monotonic_ns
 from uavctl.config import Config
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
 from uavctl.errors import ConnectionSpecError
-from uavctl.io.admission import AdmissionRules
+from uavctl.io.admission import Address, AdmissionRules
 from uavctl.io.base import Connection
 from uavctl.io.key_file import read_key
 from uavctl.io.sources import open_source
@@ -100,6 +100,14 @@ class SignedConnection:
     def send(self, data: bytes) -> None:
         """See `Connection`."""
         self._inner.send(self._authenticator.sign_frame(data, self._now()))
+
+    def find_sender(self) -> tuple[int, Address | None]:
+        """See `Connection`."""
+        return self._inner.find_sender()
+
+    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
+        """See `Connection`; its time stamp is ahead, and no stamp of this connection changes."""
+        return self._authenticator.sign_ahead(frame, self._now() + ahead_ns)
 
     def close(self) -> None:
         """See `Connection`."""

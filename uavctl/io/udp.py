@@ -184,6 +184,13 @@ class UdpInConnection(_UdpConnection):
             except OSError:
                 break
 
+    def find_sender(self) -> tuple[int, Address | None]:
+        """See `Connection`; the vehicle's own socket, which also receives its data, if there is one."""
+        if self._peer is None:
+            return -1, None
+        peer_socket = self._peer_sockets.get(self._peer)
+        return (self._socket.fileno(), self._peer) if peer_socket is None else (peer_socket.fileno(), None)
+
     def send(self, data: bytes) -> None:
         """See `Connection`; without a peer nothing is sent, which is no error."""
         if self._peer is None:

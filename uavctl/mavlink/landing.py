@@ -15,12 +15,16 @@ from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.messages import CommandAck, Heartbeat, Message
 from uavctl.mavlink.profile import PROFILES, describe_mode
 
+LandingTarget = tuple[tuple[int, int], str, tuple[bytes, ...]]
+"""Address (system, component) and autopilot of a vehicle, and the frames of a request."""
+
 
 class LandingRequest:
     """Landing request of one vehicle.
 
     Attributes:
         is_pending: Whether it has begun, and is neither answered nor over.
+        is_answered: Whether the vehicle has accepted it, or has left the modes in which it flies for us.
 
     Args:
         own_address: Our system and component.
@@ -34,7 +38,12 @@ class LandingRequest:
         self._frames: tuple[bytes, ...] = ()
         self._next_ns = self._end_ns = 0
         self._has_begun = False
-        self.is_pending = False
+        self.is_pending = self.is_answered = False
+
+    @property
+    def target(self) -> LandingTarget | None:
+        """Address and autopilot of the vehicle, and the frames for it; None before one is known."""
+        return None if self._address is None else (self._address, self._autopilot, self._frames)
 
     def prepare(self, address: tuple[int, int], autopilot: str) -> None:
         """Make the frames for a vehicle, if they are not made yet."""
@@ -64,7 +73,7 @@ class LandingRequest:
     def receive(self, data: bytes) -> None:
         """Look for the vehicle's answer in a datagram."""
         if self.is_pending and any(self._is_answer(message) for message in decode(data).messages):
-            self.is_pending = False
+            self.is_pending, self.is_answered = False, True
 
     def _is_answer(self, message: Message) -> bool:
         if (message.system, message.component) != self._address:

@@ -123,9 +123,16 @@ class FrameSigner:
     def sign(self, frame: bytes, at_ns: int) -> bytes:
         """An unsigned frame of MAVLink 2 with flag, checksum and signature; each stamp is larger than the last."""
         self._timestamps.newest = min(max(self._current_timestamp(at_ns), self._timestamps.newest + 1), MAX_TIMESTAMP)
+        return self._sign(frame, self._timestamps.newest)
+
+    def sign_ahead(self, frame: bytes, at_ns: int) -> bytes:
+        """Sign a frame for a later time; it is not new any more once another frame has been signed then."""
+        return self._sign(frame, min(max(self._current_timestamp(at_ns), self._timestamps.newest + 1), MAX_TIMESTAMP))
+
+    def _sign(self, frame: bytes, stamp: int) -> bytes:
         body = bytearray(frame[:-CHECKSUM])
         body[_FLAGS] |= _SIGNED
-        signed = add_checksum(bytes(body)) + bytes((self._link_id,)) + self._timestamps.newest.to_bytes(6, "little")
+        signed = add_checksum(bytes(body)) + bytes((self._link_id,)) + stamp.to_bytes(6, "little")
         return signed + self._key.hash(signed)
 
     def verify(self, frame: bytes, at_ns: int) -> SignatureRefusal | None:
@@ -227,3 +234,7 @@ class FrameAuthenticator:
     def sign_frame(self, frame: bytes, at_ns: int) -> bytes:
         """Sign one of our frames."""
         return self._signer.sign(frame, at_ns)
+
+    def sign_ahead(self, frame: bytes, at_ns: int) -> bytes:
+        """Sign one of our frames for a later time; see `FrameSigner.sign_ahead`."""
+        return self._signer.sign_ahead(frame, at_ns)

@@ -29,6 +29,7 @@ from logs.recording.topics import encode, get_definition
 from logs.recording.views import ViewBuilder
 from uavctl.cli.app import run
 from uavctl.errors import UsageError
+from uavctl.io.helper_process import MAX_RESTARTS
 from uavctl.records import Decision
 
 EVENT = "/uavctl/event"
@@ -261,15 +262,22 @@ def test_97_a_process_that_is_stopped_is_ended() -> None:
 
 
 @pytest.mark.fault(97)
-def test_97_a_process_that_is_killed_is_told_once_and_its_messages_are_dropped() -> None:
+def test_97_a_process_that_is_killed_is_started_again_a_limited_number_of_times() -> None:
     deaths: list[str] = []
     with serving(deaths) as live:
-        os.kill(find_child(os.getpid(), live.port), signal.SIGKILL)
-        wait_until(lambda: bool(deaths), "the death is told")
-        for number in range(100):
-            live.send(EVENT, number, b"{}")
-        assert live.dropped >= 100
-    assert deaths == ["signal 9"]
+        live.send(EVENT, 7, b"{}")
+        for count in range(1, MAX_RESTARTS + 2):
+            os.kill(find_child(os.getpid(), live.port), signal.SIGKILL)
+            wait_until(lambda count=count: len(deaths) == count, "the death is told")  # type: ignore[misc]
+            if count <= MAX_RESTARTS:
+                assert ask(live.port, make_head(LOCAL))[0] == 200
+                with Viewer(live.port) as viewer:
+                    assert viewer.channels({EVENT})  # what was sent before the death
+        assert is_refused(live.port)
+        before = live.dropped
+        live.send(EVENT, 8, b"{}")
+        assert live.dropped == before + 1
+    assert all(text.startswith("signal 9; ") for text in deaths)
 
 
 @pytest.mark.fault(97)
@@ -282,10 +290,10 @@ def test_97_a_process_that_cannot_start_is_told_with_its_cause(
     program.chmod(0o700)
     monkeypatch.setattr(sys, "executable", str(program))
     live = LiveProcess(0, deaths.append)
-    wait_until(lambda: bool(deaths), "the death is told")
+    wait_until(lambda: len(deaths) > MAX_RESTARTS, "the last death is told")
     live.send(EVENT, 0, b"{}")
     live.close()
-    assert deaths == [cause]
+    assert [text.partition(";")[0] for text in deaths] == [cause] * (MAX_RESTARTS + 1)
 
 
 def test_an_end_in_order_is_no_death() -> None:

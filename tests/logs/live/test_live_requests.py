@@ -85,6 +85,15 @@ def test_98_another_site_opens_the_websocket_with_the_token_alone(origin: str, p
 
 
 @pytest.mark.fault(98)
+@pytest.mark.parametrize(
+    ("site", "status"), [("same-origin", 200), ("none", 200), ("same-site", 403), ("cross-site", 403), ("", 403)]
+)
+def test_98_a_request_without_an_answer_for_the_page_of_another_site_takes_no_place(site: str, status: int) -> None:
+    assert check(path="/scenes", **{"Sec-Fetch-Site": site}) == status
+    assert check(path=f"/{TOKEN}", **{**HANDSHAKE, "Sec-Fetch-Site": site}) == 200
+
+
+@pytest.mark.fault(98)
 def test_98_another_site_reads_no_page_even_with_the_token() -> None:
     for path in ("/", "/live.js", "/scenes"):
         assert (check(path=path), check(path=path, Origin=FOREIGN)) == (200, 403)

@@ -1,0 +1,55 @@
+"""Time limit of a tick: what never answers is interrupted, whatever it does and catches."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+
+import pytest
+
+from uavctl.daemon.tick_limit import limit_ticks
+from uavctl.errors import TickOverdueError
+
+
+def loop_for_ever() -> None:
+    while True:
+        pass
+
+
+def sleep_for_ever() -> None:
+    time.sleep(10**6)
+
+
+def catch_errors_for_ever() -> None:
+    while True:
+        try:
+            loop_for_ever()
+        except Exception:  # noqa: BLE001 as code of another package may
+            continue
+
+
+@pytest.mark.fault(102)
+@pytest.mark.parametrize("run", [loop_for_ever, sleep_for_ever, catch_errors_for_ever])
+def test_102_a_tick_without_an_end_is_interrupted(run: Callable[[], None]) -> None:
+    with limit_ticks() as limit, pytest.raises(TickOverdueError), limit.apply():
+        run()
+
+
+@pytest.mark.fault(102)
+def test_102_an_error_that_is_swallowed_comes_again() -> None:
+    caught = []
+    with limit_ticks() as limit, pytest.raises(TickOverdueError), limit.apply():
+        try:
+            loop_for_ever()
+        except BaseException as error:  # noqa: BLE001 as code of another package may
+            caught.append(error)
+        loop_for_ever()
+    assert len(caught) == 1
+
+
+def test_nothing_is_interrupted_between_ticks() -> None:
+    before = signal.getsignal(signal.SIGURG)
+    with limit_ticks():
+        signal.raise_signal(signal.SIGURG)
+    assert signal.getsignal(signal.SIGURG) is before

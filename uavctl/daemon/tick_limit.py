@@ -1,0 +1,83 @@
+"""Time limit of a tick: a controller that never answers must not keep the loop from relaying and landing.
+
+1. A thread counts its own wake-ups while a tick runs. A computer that stands still does not count.
+2. At the limit it sends a signal to the main thread, whose handler raises in the tick. That also ends a sleep.
+3. The signal comes again after each further limit, where code of another package has swallowed the error.
+
+Code that never returns to the interpreter is not interrupted.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from uavctl.errors import TickOverdueError
+
+LIMIT_S = 1.0  # 20 ticks; vehicles leave the external mode after 0.5 to 3 s without a setpoint
+_PERIOD_S = 0.05
+_SIGNAL = signal.SIGURG  # the only one that is ignored where nobody handles it, and that no timer sends
+
+
+class TickLimit:
+    """Time limit of the ticks of the main thread."""
+
+    def __init__(self) -> None:
+        self._is_running = False
+        self._wakes = 0
+        self._done = threading.Event()
+
+    @contextmanager
+    def apply(self) -> Iterator[None]:
+        """Raise in this block once it has taken too long.
+
+        Raises:
+            TickOverdueError: it has.
+        """
+        self._wakes, self._is_running = 0, True
+        try:
+            yield
+        finally:
+            self._is_running = False
+
+    def handle_signal(self, number: int, frame: FrameType | None) -> None:
+        """Raise in the main thread, if a tick runs."""
+        del number, frame
+        if self._is_running:
+            raise TickOverdueError(f"no end of the tick within {LIMIT_S:g} s")
+
+    def watch(self, thread: int) -> None:
+        """Count while a tick runs, and send the signal at the limit; until `end`."""
+        while not self._done.wait(_PERIOD_S):
+            self._wakes += self._is_running
+            if self._is_running and self._wakes * _PERIOD_S >= LIMIT_S:
+                self._wakes = 0
+                signal.pthread_kill(thread, _SIGNAL)
+
+    def end(self) -> None:
+        """End the watch."""
+        self._done.set()
+
+
+@contextmanager
+def limit_ticks() -> Iterator[TickLimit]:
+    """Yield the limit of the ticks of this thread, which is the main thread. Without room for a thread none applies."""
+    limit, main_thread = TickLimit(), threading.main_thread()
+    previous = signal.signal(_SIGNAL, limit.handle_signal)
+    try:
+        watcher = threading.Thread(target=limit.watch, args=(main_thread.ident,), name="tick limit", daemon=True)
+        try:
+            watcher.start()
+        except (RuntimeError, MemoryError):
+            yield limit
+            return
+        try:
+            yield limit
+        finally:
+            limit.end()
+            watcher.join()
+    finally:
+        signal.signal(_SIGNAL, previous)
