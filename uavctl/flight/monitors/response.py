@@ -3,7 +3,8 @@
 1. The acceleration a is shown by inertial data; without them, by changes of the vehicle's own velocity. The setpoints
    give u, behind the vehicle's lag. Horizontal axes are compared together, the vertical axis by itself.
 2. Each hypothesis predicts a = R u - c v + d, with drag c of the velocity v, and wind d. A right response has R = g I,
-   with a gain g of 0.7 to 1.5, and may be up to 0.15 s late: the model of a vehicle is rarely exact.
+   with a gain g of 0.7 to 1.5, and may be up to 0.15 s late: the model of a vehicle is rarely exact. A wrong one
+   near to it (turned by 45°, 2.5 times as much) needs more evidence.
 3. What a hypothesis leaves is a - R u + c v. Its variance V over the last half second counts, and the jump J of its
    mean since the last seconds: a wind that sets in makes one, too. Older samples are forgotten.
 4. The evidence for a wrong response is the log-likelihood ratio of V and J against those of a right one. Where R = I
@@ -61,6 +62,7 @@ WITNESSED_PART = 0.3
 REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
 GAINS = (1.0, 0.7, 1.5)  # of a right response: the model of a vehicle is rarely exact
 LATE_NS, TOO_LATE_NS = 150_000_000, 300_000_000  # delays beyond the vehicle's lag: of a right response, of a wrong one
+RARE = 1.0  # cost of a response so near to a right one that wind or noise is taken for it sooner
 REQUESTED_NS = WINDOW_NS + TOO_LATE_NS + MOTION_NS  # setpoints are kept for so long
 
 _TIME = itemgetter(0)
@@ -73,18 +75,21 @@ Sample = tuple[float, ...]
 class _Group:
     """Hypotheses on axes that are compared together; e = a - R_0 u - R_1 u_late - R_2 u_too_late is what one leaves."""
 
-    def __init__(self, axes: Sequence[int], wrong: dict[str, Array]) -> None:
+    def __init__(self, axes: Sequence[int], wrong: dict[str, Array], rare: dict[str, Array]) -> None:
         """Make the group.
 
         Args:
             wrong: R of each wrong response: for u now.
+            rare: The same, for those near to a right one.
         """
         one, zero = np.eye(len(axes)), np.zeros((len(axes), len(axes)))
         right = [(gain * one, zero, zero) for gain in GAINS] + [(zero, gain * one, zero) for gain in GAINS]
-        rows = [*right, *((r, zero, zero) for r in wrong.values()), (zero, zero, one)]
+        rows = [*right, (zero, zero, one)]
+        rows += [(r, zero, zero) for r in (wrong | rare).values()]
         self.axes = tuple(axes)
-        self.kinds = (*wrong, "too late")
+        self.kinds = ("too late", *wrong, *rare)
         self.right = len(right)
+        self.offsets = [0.0] * (len(rows) - len(rare)) + [RARE] * len(rare)
         self.responses = np.array([np.hstack(row) for row in rows])  # (k, d, 3 d)
 
 
@@ -98,8 +103,13 @@ _HORIZONTAL = _Group(
         "mirrored in east": np.diag([1.0, -1.0]),
         "not at all": np.zeros((2, 2)),
     },
+    {
+        "turned by 45°": math.sqrt(0.5) * np.array([[1.0, -1.0], [1.0, 1.0]]),
+        "turned by 315°": math.sqrt(0.5) * np.array([[1.0, 1.0], [-1.0, 1.0]]),
+        "2.5 times as much": 2.5 * np.eye(2),
+    },
 )
-_VERTICAL = _Group((2,), {"mirrored in down": -np.eye(1), "not at all in down": np.zeros((1, 1))})
+_VERTICAL = _Group((2,), {"mirrored in down": -np.eye(1), "not at all in down": np.zeros((1, 1))}, {})
 _GROUPS = (_HORIZONTAL, _VERTICAL)
 WRONG = tuple(dict.fromkeys((*_HORIZONTAL.kinds, *_VERTICAL.kinds)))
 
@@ -275,7 +285,8 @@ def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_
     squared_v = float(change_mps @ change_mps)
     # V = var e + 2 c cov(e, v) + c² var v; J = |Δē + c Δv̄|²; each with the best c
     return [
-        _compute_cost(
+        group.offsets[k]
+        + _compute_cost(
             count,
             _remove_drag(variance[k], covariance[k], variance_v),
             _remove_drag(squared[k], along[k], squared_v),
