@@ -50,14 +50,14 @@ BASELINE_S = 10.0  # the same for the mean before a jump
 NOISE_PART, JUMP_PART = 0.2, 0.65
 NEAR, FAR = 1.4, 3.0  # bounds of the evidence: with no time left to brake, and with `FAR_S` left
 FAR_S = 1.0
-# Cost of an exact response up to which no other is compared: a wrong one soon leaves more. Measured on 100 flights, it
-# delays no discovery, and nine of ten ticks of right responses end there.
+# Cost of an exact response up to which no other is compared: a wrong one soon leaves more. In recorded flights it
+# delays a discovery by a tick or two at most, and nine of ten ticks of right responses end there.
 LITTLE = 5.0
 # Factor of the bounds for the vehicle's own velocity, which its estimator smooths, and without positions for so long:
 # inertial data and the own velocity that begin to err together would be taken for a wrong response.
 UNCERTAIN, SILENT_NS = 3.0, 400_000_000
-# Of the acceleration that positions may show unexplained: from there on they are witness of inertial data. Gusts of
-# 3 m/s show a quarter of it.
+# Of the acceleration that positions may show unexplained: from there on they are witness of inertial data. A choice:
+# more than noise of positions shows, less than a wrong response does in half a second.
 WITNESSED_PART = 0.3
 REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
 GAINS = (1.0, 0.7, 1.5)  # of a right response: the model of a vehicle is rarely exact
