@@ -26,6 +26,9 @@ TICK_NS = 50 * MS
 SECONDS = 6.0
 WRONG_S = 3.0  # from then on
 DRAG_1PS = 0.8
+COS_45 = math.sqrt(0.5)
+NEAR_TO_RIGHT = ("turned by 45°", "turned by 315°", "2.5 times as much")
+VERTICAL = {"mirrored in down": -1.0, "not at all in down": 0.0}
 ROTATIONS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "turned by 90°": ((0.0, -1.0), (1.0, 0.0)),
     "turned by 180°": ((-1.0, 0.0), (0.0, -1.0)),
@@ -33,6 +36,9 @@ ROTATIONS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "mirrored in north": ((-1.0, 0.0), (0.0, 1.0)),
     "mirrored in east": ((1.0, 0.0), (0.0, -1.0)),
     "not at all": ((0.0, 0.0), (0.0, 0.0)),
+    "turned by 45°": ((COS_45, -COS_45), (COS_45, COS_45)),
+    "turned by 315°": ((COS_45, COS_45), (-COS_45, COS_45)),
+    "2.5 times as much": ((2.5, 0.0), (0.0, 2.5)),
 }
 ROOM = replace(PARAMETERS, unexplained_mps2=1.5)
 CONSISTENT = VelocityChangeState(agreed_ns=START_NS + round(SECONDS * 1e9))  # all the time
@@ -49,6 +55,10 @@ def request(s: float) -> tuple[float, float]:
     return 2.0 * math.sin(3.5 * s), 1.6 * math.sin(2.9 * s + 1.0)
 
 
+def request_down(s: float) -> float:
+    return 1.2 * math.sin(2.2 * s)
+
+
 def fly(
     answer: Callable[[float], tuple[float, float]],
     *,
@@ -60,24 +70,34 @@ def fly(
     requested: Callable[[float], tuple[float, float]] = request,
     position_m: Vec3 | None = None,
     silent_ns: int = 0,
+    answer_down: Callable[[float], float] = request_down,
+    own_velocity: bool = True,
+    unexplained_mps2: tuple[float, float] = (0.0, 0.0),
 ) -> Flight:
-    """Show the monitor a flight in which `answer` is the acceleration that the vehicle makes of its setpoints."""
+    """Show the monitor a flight in which `answer` is the acceleration that the vehicle makes of its setpoints.
+
+    Args:
+        unexplained_mps2: What positions show beside setpoints, and beside inertial data.
+    """
     rng = np.random.default_rng(3)
-    state, velocity, flight = ResponseState(), np.zeros(2), []
+    beside, beside_inertial = np.zeros((3, 3)), np.zeros((3, 3))
+    beside[2, 0], beside_inertial[2, 0] = unexplained_mps2
+    state, velocity, down_mps, flight = ResponseState(), np.zeros(2), 0.0, []
     for tick in range(round(SECONDS * 1e9) // TICK_NS):
         at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
         accel = np.array(answer(s)) + wind(s) - drag_1ps * velocity
         velocity = velocity + TICK_NS * 1e-9 * accel
         shown = accel + rng.normal(0.0, noise_mps2, 2)
-        own: Vec3 = (float(velocity[0]), float(velocity[1]), 0.0)
+        down_mps += TICK_NS * 1e-9 * answer_down(s)
+        own: Vec3 = (float(velocity[0]), float(velocity[1]), down_mps)
         observation = structs.replace(
-            seen(at_ns, vehicle_motion=motion(own, at_ns)),
-            inertial_mps2=(float(shown[0]), float(shown[1]), 0.0) if inertial else None,
+            seen(at_ns, vehicle_motion=motion(own, at_ns) if own_velocity else None),
+            inertial_mps2=(float(shown[0]), float(shown[1]), answer_down(s)) if inertial else None,
             velocity_mps=own,
             position_m=position_m,
         )
-        observer = Observer(at_ns - silent_ns, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
-        model = Motion(model_mps2=(*requested(s), 0.0), observer=observer)
+        observer = Observer(at_ns - silent_ns, beside, np.zeros((3, 3)), np.zeros(3), inertial=beside_inertial)
+        model = Motion(model_mps2=(*requested(s), request_down(s)), observer=observer)
         state, verdict = response.update(state, TickObservation(observation, model, ROOM), change)
         assert verdict.is_none or (verdict.action, verdict.cause) == (Action.END_PLANS, EventCode.SETPOINT_RESPONSE)
         flight.append((state, not verdict.is_none))
@@ -103,15 +123,16 @@ def make_wrong(kind: str) -> Callable[[float], tuple[float, float]]:
 
 
 def test_each_wrong_response_is_tested() -> None:
-    assert set(WRONG) == {*ROTATIONS, "too late"}
+    assert set(WRONG) == {*ROTATIONS, *VERTICAL, "too late"}
 
 
 @pytest.mark.fault(101)
 @pytest.mark.parametrize(
     ("kind", "drag_1ps", "inertial"),
     [
-        *((kind, drag_1ps, True) for kind in WRONG for drag_1ps in (0.0, DRAG_1PS)),
-        *((kind, 0.0, False) for kind in ROTATIONS),  # an own velocity is too smooth to show a delay in two seconds
+        *((kind, drag_1ps, True) for kind in (*ROTATIONS, "too late") for drag_1ps in (0.0, DRAG_1PS)),
+        # An own velocity is too smooth to show a delay in two seconds, or a response near to a right one.
+        *((kind, 0.0, False) for kind in ROTATIONS if kind not in NEAR_TO_RIGHT),
     ],
 )
 def test_a_wrong_response_is_found_by_its_kind(kind: str, drag_1ps: float, inertial: bool) -> None:
@@ -120,6 +141,20 @@ def test_a_wrong_response_is_found_by_its_kind(kind: str, drag_1ps: float, inert
     assert first_s is not None and WRONG_S < first_s < WRONG_S + 2.5
     at_end = [compute_evidence(state)[1] for state, _ in flight[-20:]]
     assert kind in at_end
+
+
+@pytest.mark.fault(101)
+@pytest.mark.parametrize(
+    ("kind", "inertial"), [("mirrored in down", True), ("mirrored in down", False), ("not at all in down", True)]
+)
+def test_a_wrong_response_of_the_vertical_axis_is_found_by_its_kind(kind: str, inertial: bool) -> None:
+    def answer_down(s: float) -> float:
+        return request_down(s) * (VERTICAL[kind] if s >= WRONG_S else 1.0)
+
+    flight = fly(request, answer_down=answer_down, inertial=inertial)
+    first_s = get_first_s(flight)
+    assert first_s is not None and WRONG_S < first_s < WRONG_S + 2.5
+    assert kind in [compute_evidence(state)[1] for state, _ in flight[-20:]]
 
 
 @pytest.mark.parametrize("inertial", [True, False])
@@ -178,6 +213,34 @@ def test_inertial_data_alone_prove_nothing() -> None:
         assert get_first_s(flight) is None and compute_evidence(flight[-1][0])[0] > FAR
 
 
+WITNESSED_MPS2 = response.WITNESSED_PART * ROOM.unexplained_mps2
+
+
+@pytest.mark.fault(101)
+@pytest.mark.parametrize(
+    ("unexplained_mps2", "is_found"),
+    [
+        ((WITNESSED_MPS2 + 0.01, 0.0), True),
+        ((WITNESSED_MPS2 - 0.01, 0.0), False),
+        ((2.0, 0.99), True),
+        ((2.0, 1.01), False),
+        ((0.0, 4.0), False),  # inertial data are wrong
+    ],
+)
+def test_positions_are_witness_where_no_own_velocity_comes(
+    unexplained_mps2: tuple[float, float], is_found: bool
+) -> None:
+    for own_velocity, silent_ns, finds in ((False, 0, is_found), (True, 0, False), (False, 401 * MS, False)):
+        flight = fly(
+            make_wrong("turned by 180°"),
+            change=VelocityChangeState(),
+            own_velocity=own_velocity,
+            unexplained_mps2=unexplained_mps2,
+            silent_ns=silent_ns,
+        )
+        assert (get_first_s(flight) is not None) == finds
+
+
 def test_it_takes_more_evidence_where_no_position_comes() -> None:
     first_s = [get_first_s(fly(make_wrong("turned by 180°"), silent_ns=ns * MS)) for ns in (400, 401)]
     assert first_s[0] is not None and first_s[1] is not None and first_s[0] < first_s[1]
@@ -216,19 +279,44 @@ def test_the_bound_is_met_at_a_second_before_the_last_moment_to_brake() -> None:
             assert response._compute_bound(tick, PARAMETERS) == pytest.approx(bound)
 
 
+@pytest.mark.parametrize(
+    ("north_m", "north_mps", "says"),
+    [
+        (0.0, 1.0, None),
+        (2.9, 1.0, "0.1 m before the north limit at 1.0 m/s"),
+        (2.9, -1.0, None),
+        (-2.8, -2.0, "0.2 m before the south limit at 2.0 m/s"),
+        (3.25, 1.0, "0.2 m beyond the north limit at 1.0 m/s"),
+    ],
+)
+def test_the_cause_says_where_the_speed_allowed_no_stop(north_m: float, north_mps: float, says: str | None) -> None:
+    for own in (None, motion((north_mps, 0.0, 0.0), START_NS)):
+        tick = structs.replace(
+            seen(START_NS, vehicle_motion=own),
+            position_m=(north_m, 0.0, -2.0),
+            velocity_mps=(north_mps if own is None else 0.0, 0.0, 0.0),
+        )
+        text = response._describe_overrun(tick, PARAMETERS)
+        assert says in text if says else not text
+
+
 def test_a_gap_in_inertial_data_begins_anew() -> None:
-    state = ResponseState(requested=((START_NS, (0.0, 0.0)),), inertial_ns=START_NS, moments=np.ones((11, 11)))
+    last = (float(START_NS), 1.0, *[0.0] * 9)
+    state = ResponseState(
+        requested=((START_NS, ZERO),), inertial_ns=START_NS, samples=(last,), recent=(1.0, *[0.0] * 6)
+    )
     for gap_ns, count in ((300 * MS, 1.0), (300 * MS + 1, 0.0)):
         tick = structs.replace(seen(START_NS + gap_ns), inertial_mps2=ZERO)
         after, _ = response.update(state, TickObservation(tick, Motion(), PARAMETERS), CONSISTENT)
         span = gap_ns * 1e-9 / response.CORRELATED_S
         kept = math.exp(-gap_ns * 1e-9 / response.MEMORY_S) * count
-        assert float(after.moments[-1, -1]) == pytest.approx(kept + span)
+        assert after.recent[0] == pytest.approx(kept + span)
+        assert len(after.samples) == 1 + count
 
 
 def test_an_own_velocity_shows_nothing_beside_inertial_data_or_right_after_another() -> None:
     own: Vec3 = (1.0, 0.0, 0.0)
-    before = ResponseState(requested=((START_NS, (0.0, 0.0)),), velocity=(START_NS, (0.5, 0.0)))
+    before = ResponseState(requested=((START_NS, ZERO),), velocity=(START_NS, (0.5, 0.0, 0.0)))
     for state, ms, is_sample in (
         (before, 50, True),
         (before, 49, False),
@@ -238,4 +326,4 @@ def test_an_own_velocity_shows_nothing_beside_inertial_data_or_right_after_anoth
         at_ns = START_NS + ms * MS
         tick = seen(at_ns, vehicle_motion=motion(own, at_ns))
         after, _ = response.update(state, TickObservation(tick, Motion(), PARAMETERS), CONSISTENT)
-        assert (float(after.moments[-1, -1]) > 0.0) == is_sample
+        assert bool(after.samples) == is_sample

@@ -1,15 +1,17 @@
 """Monitor: does the vehicle answer setpoints as they say, or turned, mirrored, late, or not at all?
 
 1. The acceleration a is shown by inertial data; without them, by changes of the vehicle's own velocity. The setpoints
-   give u, behind the vehicle's lag. All is horizontal.
+   give u, behind the vehicle's lag. Horizontal axes are compared together, the vertical axis by itself.
 2. Each hypothesis predicts a = R u - c v + d, with drag c of the velocity v, and wind d. A right response has R = g I,
-   with a gain g of 0.7 to 1.5, and may be up to 0.15 s late: the model of a vehicle is rarely exact.
+   with a gain g of 0.7 to 1.5, and may be up to 0.15 s late: the model of a vehicle is rarely exact. A wrong one
+   near to it (turned by 45°, 2.5 times as much) needs more evidence.
 3. What a hypothesis leaves is a - R u + c v. Its variance V over the last half second counts, and the jump J of its
    mean since the last seconds: a wind that sets in makes one, too. Older samples are forgotten.
-4. The evidence for a wrong response is the log-likelihood ratio of V and J against those of a right one.
+4. The evidence for a wrong response is the log-likelihood ratio of V and J against those of a right one. Where R = I
+   leaves little, nothing else is compared.
 5. Evidence above a bound ends the plans. The bound is lower where little time is left to brake before a wall.
-6. Inertial data count only while the vehicle's own velocity changes as they do. Nothing counts while both contradict
-   each other: one of them is wrong.
+6. Inertial data count only while the vehicle's own velocity changes as they do. Where no own velocity comes, positions
+   are witness. Nothing counts while both sources contradict each other: one of them is wrong.
 
 Positions are right, so they go on to the vehicle.
 
@@ -22,6 +24,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from operator import itemgetter
 
 import msgspec
@@ -32,64 +35,96 @@ from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import MOTION_NS, EnvelopeParameters, Observation, read_vehicle_velocity
-from uavctl.flight.monitors.observer import DRAG_1PS
+from uavctl.flight.monitors.observer import DRAG_1PS, measure_size_mps2, remove_drag
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
+from uavctl.records import Vec3
 
 MEMORY_S = 0.4  # time constant with which samples are forgotten
 CORRELATED_S = 0.05  # for so long what is left is about the same: one sample
 LEAST_SAMPLES = 4.0
+WINDOW_NS = 2_000_000_000  # samples older than five time constants weigh less than a hundredth
 BASELINE_S = 10.0  # the same for the mean before a jump
 # Of the acceleration that positions may show unexplained (1.5 m/s² in a room), standard deviations of what a right
 # response leaves (attitude loop, noise of inertial data), and of a jump of the wind.
 NOISE_PART, JUMP_PART = 0.2, 0.65
 NEAR, FAR = 1.4, 3.0  # bounds of the evidence: with no time left to brake, and with `FAR_S` left
 FAR_S = 1.0
+# Cost of an exact response up to which no other is compared: a wrong one soon leaves more. In recorded flights it
+# delays a discovery by a tick or two at most, and nine of ten ticks of right responses end there.
+LITTLE = 5.0
 # Factor of the bounds for the vehicle's own velocity, which its estimator smooths, and without positions for so long:
 # inertial data and the own velocity that begin to err together would be taken for a wrong response.
 UNCERTAIN, SILENT_NS = 3.0, 400_000_000
+# Of the acceleration that positions may show unexplained: from there on they are witness of inertial data. A choice:
+# more than noise of positions shows, less than a wrong response does in half a second.
+WITNESSED_PART = 0.3
 REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
 GAINS = (1.0, 0.7, 1.5)  # of a right response: the model of a vehicle is rarely exact
 LATE_NS, TOO_LATE_NS = 150_000_000, 300_000_000  # delays beyond the vehicle's lag: of a right response, of a wrong one
+RARE = 1.0  # cost of a response so near to a right one that wind or noise is taken for it sooner
+REQUESTED_NS = WINDOW_NS + TOO_LATE_NS + MOTION_NS  # setpoints are kept for so long
 
-Pair = tuple[float, float]  # north, east
-
-_I, _0 = np.eye(2), np.zeros((2, 2))
-# Hypotheses: R for u now, u of `LATE_NS` ago, u of `TOO_LATE_NS` ago.
-_RIGHT = tuple((gain * _I, _0, _0) for gain in GAINS) + tuple((_0, gain * _I, _0) for gain in GAINS)
-_WRONG = {
-    "turned by 90°": (np.array([[0.0, -1.0], [1.0, 0.0]]), _0, _0),
-    "turned by 180°": (-_I, _0, _0),
-    "turned by 270°": (np.array([[0.0, 1.0], [-1.0, 0.0]]), _0, _0),
-    "mirrored in north": (np.diag([-1.0, 1.0]), _0, _0),
-    "mirrored in east": (np.diag([1.0, -1.0]), _0, _0),
-    "not at all": (_0, _0, _0),
-    "too late": (_0, _0, _I),
-}
-WRONG = tuple(_WRONG)
-# A sample is z = (a, u now, u late, u too late, v, 1), and e = M z is what a hypothesis leaves: M = (I, -R..., 0).
-_ONE = np.zeros((2, 1))
-_LEFT = [np.hstack([_I, *(-r for r in rows), _0, _ONE]) for rows in (*_RIGHT, *_WRONG.values())]
-_VELOCITY = np.hstack([_0, _0, _0, _0, _I, _ONE])
-_SIZE = 11
-_COUNT = len(_LEFT)
-# With S = Σ w z z': Σ |e|² = <M' M, S>, Σ e' v = <M' N, S>, Σ |v|² = <N' N, S>, and Σ e = M S (0, ..., 0, 1)'
-_SQUARES = np.array([(m.T @ m).ravel() for m in (*_LEFT, _VELOCITY)])
-_PRODUCTS = np.array([(m.T @ _VELOCITY).ravel() for m in _LEFT])
-_SUMS = np.array([np.outer(row, np.eye(_SIZE)[-1]).ravel() for m in (*_LEFT, _VELOCITY) for row in m])
-_FORMS = np.vstack([_SQUARES, _PRODUCTS, _SUMS])
 _TIME = itemgetter(0)
+_LIMITS = (("south", "north"), ("west", "east"), ("upper", "lower"))
+
+# A sample: time [ns] and weight; acceleration, that by setpoints, and velocity, each (3,)
+Sample = tuple[float, ...]
 
 
-class ResponseState(msgspec.Struct, frozen=True, eq=False):
+class _Group:
+    """Hypotheses on axes that are compared together; e = a - R_0 u - R_1 u_late - R_2 u_too_late is what one leaves."""
+
+    def __init__(self, axes: Sequence[int], wrong: dict[str, Array], rare: dict[str, Array]) -> None:
+        """Make the group.
+
+        Args:
+            wrong: R of each wrong response: for u now.
+            rare: The same, for those near to a right one.
+        """
+        one, zero = np.eye(len(axes)), np.zeros((len(axes), len(axes)))
+        right = [(gain * one, zero, zero) for gain in GAINS] + [(zero, gain * one, zero) for gain in GAINS]
+        rows = [*right, (zero, zero, one)]
+        rows += [(r, zero, zero) for r in (wrong | rare).values()]
+        self.axes = tuple(axes)
+        self.kinds = ("too late", *wrong, *rare)
+        self.right = len(right)
+        self.offsets = [0.0] * (len(rows) - len(rare)) + [RARE] * len(rare)
+        self.responses = np.array([np.hstack(row) for row in rows])  # (k, d, 3 d)
+
+
+_HORIZONTAL = _Group(
+    (0, 1),
+    {
+        "turned by 90°": np.array([[0.0, -1.0], [1.0, 0.0]]),
+        "turned by 180°": -np.eye(2),
+        "turned by 270°": np.array([[0.0, 1.0], [-1.0, 0.0]]),
+        "mirrored in north": np.diag([-1.0, 1.0]),
+        "mirrored in east": np.diag([1.0, -1.0]),
+        "not at all": np.zeros((2, 2)),
+    },
+    {
+        "turned by 45°": math.sqrt(0.5) * np.array([[1.0, -1.0], [1.0, 1.0]]),
+        "turned by 315°": math.sqrt(0.5) * np.array([[1.0, 1.0], [-1.0, 1.0]]),
+        "2.5 times as much": 2.5 * np.eye(2),
+    },
+)
+_VERTICAL = _Group((2,), {"mirrored in down": -np.eye(1), "not at all in down": np.zeros((1, 1))}, {})
+_GROUPS = (_HORIZONTAL, _VERTICAL)
+WRONG = tuple(dict.fromkeys((*_HORIZONTAL.kinds, *_VERTICAL.kinds)))
+
+
+class ResponseState(msgspec.Struct, frozen=True):
     """State of the monitor."""
 
-    requested: tuple[tuple[int, Pair], ...] = ()  # u of the last ticks, oldest first
+    requested: tuple[tuple[int, Vec3], ...] = ()  # u of the last ticks, oldest first
     inertial_ns: int | None = None  # tick of the newest inertial data [ns]; None before any
-    velocity: tuple[int, Pair] | None = None  # the vehicle's own velocity, without inertial data; None before any
-    moments: Array = np.zeros((_SIZE, _SIZE))  # Σ w z z' over the samples, where forgotten ones count less
-    # The same over a longer time: Σ w, and Σ w e (north, east) of a right response, Σ w v (north, east)
-    baseline: tuple[float, ...] = (0.0,) * 5
+    velocity: tuple[int, Vec3] | None = None  # the vehicle's own velocity, without inertial data; None before any
+    samples: tuple[Sample, ...] = ()  # of the window, oldest first
+    # Sums over samples, where forgotten ones count less: w, w e (3), w e² (3), with e of a right response
+    recent: tuple[float, ...] = (0.0,) * 7
+    # The same over a longer time: w, w e (3), w v (3)
+    baseline: tuple[float, ...] = (0.0,) * 7
 
 
 class _Acceleration(msgspec.Struct, frozen=True):
@@ -97,7 +132,7 @@ class _Acceleration(msgspec.Struct, frozen=True):
 
     middle_ns: int
     span_s: float
-    accel_mps2: Pair
+    accel_mps2: Vec3
 
 
 def update(
@@ -108,68 +143,83 @@ def update(
     Args:
         change: State of the monitor that compares inertial data with the vehicle's own velocity, after this tick.
     """
-    tick, (north, east, _) = observation.tick, observation.motion.model_mps2
-    kept = state.requested[bisect_right(state.requested, tick.at_ns - TOO_LATE_NS - MOTION_NS, key=_TIME) :]
-    state, shown = _find_acceleration(replace(state, requested=(*kept, (tick.at_ns, (north, east)))), tick)
+    tick, (north, east, down) = observation.tick, observation.motion.model_mps2
+    kept = state.requested[bisect_right(state.requested, tick.at_ns - REQUESTED_NS, key=_TIME) :]
+    state, shown = _find_acceleration(replace(state, requested=(*kept, (tick.at_ns, (north, east, down)))), tick)
     if change.contradicts:
         return ResponseState(requested=state.requested), NO_VERDICT
     if shown is None:
         return state, NO_VERDICT
     state = _add_sample(state, shown, tick)
     by_inertial = tick.inertial_mps2 is not None
-    if by_inertial and not change.supports_velocity(tick.at_ns):
-        return state, NO_VERDICT
-    evidence, kind = compute_evidence(state, observation.parameters.unexplained_mps2)
     observer = observation.motion.observer
     is_silent = observer is None or tick.at_ns - observer.at_ns > SILENT_NS
+    if by_inertial and not change.supports_velocity(tick.at_ns) and (is_silent or not _is_witnessed(observation)):
+        return state, NO_VERDICT
+    evidence, kind = compute_evidence(state, observation.parameters.unexplained_mps2)
     factor = 1.0 if by_inertial and not is_silent else UNCERTAIN
     if evidence <= factor * NEAR or evidence <= factor * _compute_bound(tick, observation.parameters):
         return state, NO_VERDICT
     text = f"the vehicle does not answer setpoints as they say ({kind}), or a strong wind has set in"
-    return state, end_plans(EventCode.SETPOINT_RESPONSE, text)
+    return state, end_plans(EventCode.SETPOINT_RESPONSE, text + _describe_overrun(tick, observation.parameters))
+
+
+def _is_witnessed(observation: TickObservation) -> bool:
+    """Whether positions show the acceleration of inertial data, and not that of setpoints, in place of an own velocity.
+
+    A right response shows the opposite, whatever inertial data say.
+    """
+    tick, observer = observation.tick, observation.motion.observer
+    if observer is None or observer.inertial is None or read_vehicle_velocity(tick.motion, tick.at_ns) is not None:
+        return False
+    beside_sent_mps2, beside_inertial_mps2 = (
+        measure_size_mps2(remove_drag(mean)) for mean in (observer.mean, observer.inertial)
+    )
+    shown_mps2 = WITNESSED_PART * observation.parameters.unexplained_mps2
+    return beside_sent_mps2 > max(shown_mps2, 2.0 * beside_inertial_mps2)
 
 
 def _find_acceleration(state: ResponseState, tick: Observation) -> tuple[ResponseState, _Acceleration | None]:
     """Find the acceleration that this tick shows, if any."""
     before_ns = state.requested[-2][0] if len(state.requested) > 1 else tick.at_ns
     if tick.inertial_mps2 is not None:
-        north, east, _ = tick.inertial_mps2
         if state.inertial_ns is None or tick.at_ns - state.inertial_ns > MOTION_NS:
             state = ResponseState(requested=state.requested)
-        shown = _Acceleration(tick.at_ns, (tick.at_ns - before_ns) * 1e-9, (north, east))
+        shown = _Acceleration(tick.at_ns, (tick.at_ns - before_ns) * 1e-9, tick.inertial_mps2)
         return replace(state, inertial_ns=tick.at_ns, velocity=None), shown
     own, motion = read_vehicle_velocity(tick.motion, tick.at_ns), tick.motion
     has_inertial = state.inertial_ns is not None and tick.at_ns - state.inertial_ns <= MOTION_NS
     if has_inertial or own is None or motion is None or motion.velocity_ns is None:
         return replace(state, velocity=None), None
-    before, now = state.velocity, (motion.velocity_ns, (own[0], own[1]))
+    before, now = state.velocity, (motion.velocity_ns, own)
     if before is None or now[0] - before[0] > MOTION_NS:
         return ResponseState(requested=state.requested, velocity=now), None
     span_s = (now[0] - before[0]) * 1e-9
     if span_s < CORRELATED_S:
         return state, None
     # a = Δv / Δt
-    north, east = ((v - v_before) / span_s for v, v_before in zip(now[1], before[1], strict=True))
-    return replace(state, velocity=now), _Acceleration((now[0] + before[0]) // 2, span_s, (north, east))
+    north, east, down = ((v - v_before) / span_s for v, v_before in zip(now[1], before[1], strict=True))
+    return replace(state, velocity=now), _Acceleration((now[0] + before[0]) // 2, span_s, (north, east, down))
 
 
 def _add_sample(state: ResponseState, shown: _Acceleration, tick: Observation) -> ResponseState:
     """Add a sample; those before count less."""
-    now, late, too_late = (_find_requested(state, shown.middle_ns - ns) for ns in (0, LATE_NS, TOO_LATE_NS))
-    velocity = read_vehicle_velocity(tick.motion, tick.at_ns) or tick.velocity_mps
-    north, east = (v if math.isfinite(v) else 0.0 for v in velocity[:2])
-    accel, weight = shown.accel_mps2, shown.span_s / CORRELATED_S
-    z = np.array([*accel, *now, *late, *too_late, north, east, 1.0])
-    # w = Δt / t_c; S = e^(-Δt/τ) S + w z z'
-    moments = math.exp(-shown.span_s / MEMORY_S) * state.moments + (weight * z)[:, None] * z
-    remaining, added = math.exp(-shown.span_s / BASELINE_S), (1.0, accel[0] - now[0], accel[1] - now[1], north, east)
-    baseline = tuple(remaining * sum_before + weight * x for sum_before, x in zip(state.baseline, added, strict=True))
-    return replace(state, moments=moments, baseline=baseline)
-
-
-def _find_requested(state: ResponseState, at_ns: int) -> Pair:
-    """Find the acceleration that setpoints gave at a time; the oldest one for all before."""
-    return state.requested[max(bisect_right(state.requested, at_ns, key=_TIME) - 1, 0)][1]
+    now = state.requested[max(bisect_right(state.requested, shown.middle_ns, key=_TIME) - 1, 0)][1]
+    own = read_vehicle_velocity(tick.motion, tick.at_ns) or tick.velocity_mps
+    velocity = [v if math.isfinite(v) else 0.0 for v in own]
+    # w = Δt / t_c; S = e^(-Δt/τ) S + w x
+    weight = shown.span_s / CORRELATED_S
+    left = [a - u for a, u in zip(shown.accel_mps2, now, strict=True)]
+    kept, kept_long = math.exp(-shown.span_s / MEMORY_S), math.exp(-shown.span_s / BASELINE_S)
+    recent, baseline = (1.0, *left, *(e * e for e in left)), (1.0, *left, *velocity)
+    sample = (float(shown.middle_ns), weight, *shown.accel_mps2, *now, *velocity)
+    first = bisect_right(state.samples, shown.middle_ns - WINDOW_NS, key=_TIME)
+    return replace(
+        state,
+        samples=(*state.samples[first:], sample),
+        recent=tuple([kept * total + weight * x for total, x in zip(state.recent, recent, strict=True)]),
+        baseline=tuple([kept_long * total + weight * x for total, x in zip(state.baseline, baseline, strict=True)]),
+    )
 
 
 def compute_evidence(state: ResponseState, unexplained_mps2: float) -> tuple[float, str]:
@@ -178,36 +228,73 @@ def compute_evidence(state: ResponseState, unexplained_mps2: float) -> tuple[flo
     Args:
         unexplained_mps2: Acceleration that positions may show unexplained.
     """
-    count = float(state.moments[-1, -1])
-    if count < LEAST_SAMPLES:
-        return 0.0, ""
-    forms: list[float] = (_FORMS @ state.moments.ravel() / count).tolist()
-    squares, products, means = forms[: _COUNT + 1], forms[_COUNT + 1 : 2 * _COUNT + 1], forms[2 * _COUNT + 1 :]
-    before = [total / state.baseline[0] for total in state.baseline[1:]]
-    velocity_mps = means[-2], means[-1]
-    change_mps = velocity_mps[0] - before[2], velocity_mps[1] - before[3]
-    variance_v = squares[_COUNT] - _dot(velocity_mps, velocity_mps)
+    best = 0.0, ""
+    if state.recent[0] < LEAST_SAMPLES:
+        return best
     noise_mps2, jump_mps2 = NOISE_PART * unexplained_mps2, JUMP_PART * unexplained_mps2
+    for group in _GROUPS:
+        if _leaves_little(state, group, noise_mps2, jump_mps2):
+            continue
+        costs = _compute_costs(state, group, noise_mps2, jump_mps2)
+        wrong = costs[group.right :]
+        least = min(wrong)
+        best = max(best, (min(costs[: group.right]) - least, group.kinds[wrong.index(least)]))
+    return best
 
-    def compute_cost(k: int) -> float:
-        mean = means[2 * k], means[2 * k + 1]
-        jump = mean[0] - before[0], mean[1] - before[1]
-        # var e = mean |e|² - |ē|²; cov(e, v) = mean e' v - ē' v̄
-        variance, covariance = squares[k] - _dot(mean, mean), products[k] - _dot(mean, velocity_mps)
-        # V = var e + 2 c cov(e, v) + c² var v; J = |Δē + c Δv̄|²; each with the best c
-        left = _remove_drag(variance, covariance, variance_v)
-        jumped = _remove_drag(_dot(jump, jump), _dot(jump, change_mps), _dot(change_mps, change_mps))
-        # -ln p = n / 2 ln(1 + V / σ²) + J / 2 σ_J²
-        return 0.5 * count * math.log(1.0 + left / noise_mps2**2) + jumped / (2.0 * jump_mps2**2)
 
-    right = math.inf
-    for k in range(len(_RIGHT)):
-        right = min(right, compute_cost(k))
-        if right <= NEAR:  # no cost is below zero, so the evidence is below each bound
-            return 0.0, ""
-    wrong = [compute_cost(k) for k in range(len(_RIGHT), _COUNT)]
-    least = min(wrong)
-    return right - least, WRONG[wrong.index(least)]
+def _leaves_little(state: ResponseState, group: _Group, noise_mps2: float, jump_mps2: float) -> bool:
+    """Whether an exact response leaves so little that no other needs to be compared: a check at little cost."""
+    count, before = state.recent[0], state.baseline
+    variance = jumped = 0.0
+    for axis in group.axes:
+        mean = state.recent[1 + axis] / count
+        variance += state.recent[4 + axis] / count - mean * mean
+        jumped += (mean - before[1 + axis] / before[0]) ** 2
+    return _compute_cost(count, max(variance, 0.0), jumped, noise_mps2, jump_mps2) <= LITTLE
+
+
+def _compute_cost(count: float, variance: float, jumped: float, noise_mps2: float, jump_mps2: float) -> float:
+    # -ln p = n / 2 ln(1 + V / σ²) + J / 2 σ_J²
+    return 0.5 * count * math.log(1.0 + variance / noise_mps2**2) + jumped / (2.0 * jump_mps2**2)
+
+
+def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_mps2: float) -> list[float]:
+    """Compute the negative log-likelihood of each hypothesis of a group."""
+    samples, axes = np.array(state.samples), group.axes
+    at_ns, requested_ns = samples[:, 0], np.array([float(ns) for ns, _ in state.requested])
+    requested = np.array([u for _, u in state.requested])[:, axes]
+    delayed = [
+        requested[np.maximum(np.searchsorted(requested_ns, at_ns - ns, side="right") - 1, 0)]
+        for ns in (LATE_NS, TOO_LATE_NS)
+    ]
+    accel, now, velocity = (samples[:, [first + axis for axis in axes]] for first in (2, 5, 8))
+    weights = samples[:, 1] * np.exp((at_ns - at_ns[-1]) * (1e-9 / MEMORY_S))
+    count = float(weights.sum())
+    weights = weights / count
+    # e = a - R u: (k, n, d)
+    left = accel - np.hstack([now, *delayed]) @ group.responses.transpose(0, 2, 1)
+    mean, mean_mps = weights @ left, weights @ velocity
+    left, velocity = left - mean[:, None], velocity - mean_mps
+    # var e, cov(e, v), var v
+    variance, covariance = (((left * other).sum(axis=2) @ weights).tolist() for other in (left, velocity))
+    variance_v = float((velocity * velocity).sum(axis=1) @ weights)
+    before = [total / state.baseline[0] for total in state.baseline]
+    jump = mean - [before[1 + axis] for axis in axes]
+    change_mps = mean_mps - [before[4 + axis] for axis in axes]
+    squared, along = (jump * jump).sum(axis=1).tolist(), (jump @ change_mps).tolist()
+    squared_v = float(change_mps @ change_mps)
+    # V = var e + 2 c cov(e, v) + c² var v; J = |Δē + c Δv̄|²; each with the best c
+    return [
+        group.offsets[k]
+        + _compute_cost(
+            count,
+            _remove_drag(variance[k], covariance[k], variance_v),
+            _remove_drag(squared[k], along[k], squared_v),
+            noise_mps2,
+            jump_mps2,
+        )
+        for k in range(len(group.responses))
+    ]
 
 
 def _remove_drag(left: float, with_velocity: float, speed: float) -> float:
@@ -217,26 +304,46 @@ def _remove_drag(left: float, with_velocity: float, speed: float) -> float:
     return max(left + 2.0 * drag_1ps * with_velocity + drag_1ps**2 * speed, 0.0)
 
 
-def _dot(a: Pair, b: Pair) -> float:
-    return a[0] * b[0] + a[1] * b[1]
-
-
 def _compute_bound(tick: Observation, parameters: EnvelopeParameters) -> float:
     """Compute the bound of the evidence, by the time that is left to brake before a wall."""
-    if tick.position_m is None:
-        return FAR
     left_s = FAR_S
+    for _, distance_m, speed_mps, brake_mps2 in _list_approaches(tick, parameters, tick.velocity_mps):
+        # t = (x - v T - v² / 2 a) / v
+        left_s = min(left_s, distance_m / speed_mps - REACTION_S - speed_mps / (2.0 * brake_mps2))
+    return NEAR + (FAR - NEAR) * max(left_s, 0.0) / FAR_S
+
+
+def _list_approaches(
+    tick: Observation, parameters: EnvelopeParameters, velocity_mps: Vec3
+) -> list[tuple[str, float, float, float]]:
+    """List the limits that the vehicle flies to: name, distance [m], speed [m/s], and deceleration [m/s²]."""
+    if tick.position_m is None:
+        return []
+    approaches = []
     rows = zip(
-        tick.position_m[:2],
-        tick.velocity_mps[:2],
-        parameters.lower_m[:2],
-        parameters.upper_m[:2],
-        parameters.brake_mps2[:2],
+        _LIMITS,
+        tick.position_m,
+        velocity_mps,
+        parameters.lower_m,
+        parameters.upper_m,
+        parameters.brake_mps2,
         strict=True,
     )
-    for position, velocity, lower, upper, brake in rows:
-        distance_m, speed_mps = (upper - position, velocity) if velocity > 0.0 else (position - lower, -velocity)
-        if speed_mps > 0.0:
-            # t = (x - v T - v² / 2 a) / v
-            left_s = min(left_s, distance_m / speed_mps - REACTION_S - speed_mps / (2.0 * brake))
-    return NEAR + (FAR - NEAR) * max(left_s, 0.0) / FAR_S
+    for (below, above), position, velocity, lower, upper, brake in rows:
+        if velocity > 0.0:
+            approaches.append((above, upper - position, velocity, brake))
+        elif velocity < 0.0:
+            approaches.append((below, position - lower, -velocity, brake))
+    return approaches
+
+
+def _describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
+    """Return in words the limits before which the vehicle cannot stop any more."""
+    text = ""
+    velocity_mps = read_vehicle_velocity(tick.motion, tick.at_ns) or tick.velocity_mps
+    for limit, distance_m, speed_mps, brake_mps2 in _list_approaches(tick, parameters, velocity_mps):
+        # x < v T + v² / 2 a
+        if distance_m < speed_mps * REACTION_S + speed_mps**2 / (2.0 * brake_mps2):
+            place = f"{distance_m:.1f} m before" if distance_m > 0.0 else f"{-distance_m:.1f} m beyond"
+            text += f"; {place} the {limit} limit at {speed_mps:.1f} m/s, it could not stop in time"
+    return text
