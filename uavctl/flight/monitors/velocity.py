@@ -4,7 +4,8 @@
 2. The slope of the offsets over a second or so is the difference of both velocities. Stamps that are late explain a
    part that is the acceleration times the delay. What is left is compared with its bound. Then: end the plans.
 3. The mean offsets of half a minute show a frame that creeps: their change is compared with a bound that grows with
-   time. Smoothing in a camera system explains a part: a delay times the change of the velocity. Then: end the plans.
+   time. Smoothing in a camera system explains a part: one delay for all, times the change of the velocity. Then: end
+   the plans.
 4. Velocities contradicted each other, and then no position came for 0.6 s. Then: end the plans.
 5. While positions that have come back correct the vehicle's own velocity, no difference counts.
 
@@ -41,6 +42,7 @@ SHORTEST = 0.3  # of the window: over less, two velocities are not compared
 PLACES_NS, PLACE_NS = 30_000_000_000, 1_000_000_000  # mean offsets are compared over so long, one for each such time
 # Of the disagreement: the bound of a change of offset begins with so many seconds of it, and grows by such a part.
 DRIFT_S, DRIFT_PART = 2.0, 0.16
+LEAST_PLACES = 4  # that tell a drift from the delay of smoothing
 LEAST_OFFSETS = 3  # for a slope
 NOISE_SIGMA = 4.0  # standard deviations of a slope that chance may make
 _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
@@ -137,9 +139,13 @@ def _find_drift(
     place: list[float] = mean.tolist()
     places = places[bisect_right(places, at_ns - PLACES_NS, key=_TIME) :]
     velocity = _find_mean_velocity(path, offsets)
+    late_s = _find_delay_s((*places, (at_ns, tuple(place), velocity)))
     for since_ns, before, velocity_before in places:
         s, off = (at_ns - since_ns) * 1e-9, [now - then for now, then in zip(place, before, strict=True)]
-        off = _remove_smoothing(off, [now - then for now, then in zip(velocity, velocity_before, strict=True)])
+        change_mps = [now - then for now, then in zip(velocity, velocity_before, strict=True)]
+        # Δo + τ Δv
+        pair_late_s = _bound_delay_s(off, change_mps) if late_s is None else late_s
+        off = [o + pair_late_s * v for o, v in zip(off, change_mps, strict=True)]
         # |ō - ō_0| > (2 s + 0.16 s) v_max
         if math.hypot(*off) > (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps:
             return (s, off), places
@@ -158,14 +164,25 @@ def _find_mean_velocity(path: tuple[tuple[int, Vector], ...], offsets: Offsets) 
     return tuple((s_1 - s_0) / ((end_ns - begin_ns) * 1e-9) for s_0, s_1 in zip(begin, end, strict=True))
 
 
-def _remove_smoothing(off: list[float], change_mps: list[float]) -> list[float]:
-    """Return a change of offsets (3,) [m] without the part that smoothing makes of a change of the velocity (3,)."""
+def _bound_delay_s(off: list[float], change_mps: list[float]) -> float:
+    """Return the delay [s] by which smoothing may explain most of a change of offsets (3,) by that of the velocity."""
     along = sum(v * v for v in change_mps)
-    if along == 0.0:
-        return off
-    # τ = -Δo' Δv / Δv' Δv, within [0, τ_max]; Δo + τ Δv
-    late_s = min(max(-sum(o * v for o, v in zip(off, change_mps, strict=True)) / along, 0.0), SMOOTHED_S)
-    return [o + late_s * v for o, v in zip(off, change_mps, strict=True)]
+    # τ = -Δo' Δv / Δv' Δv, within [0, τ_max]
+    delay_s = -sum(o * v for o, v in zip(off, change_mps, strict=True)) / along if along > 0.0 else 0.0
+    return min(max(delay_s, 0.0), SMOOTHED_S)
+
+
+def _find_delay_s(places: Places) -> float | None:
+    """Find the one delay [s] by which smoothing explains all mean offsets, beside a drift; None from too few."""
+    if len(places) < LEAST_PLACES:
+        return None
+    times_s = np.array([(at_ns - places[0][0]) * 1e-9 for at_ns, _, _ in places])
+    values = np.array([(*offset, *velocity) for _, offset, velocity in places])
+    # o' = o - ō - t' (Σ t' o / Σ t'²), and v' alike: without their lines in time
+    centred = times_s - np.add.reduce(times_s) / len(places)
+    values = values - np.add.reduce(values, axis=0) / len(places)
+    values = values - np.outer(centred, centred @ values / float(centred @ centred))
+    return _bound_delay_s(values[:, :3].ravel().tolist(), values[:, 3:].ravel().tolist())
 
 
 def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) -> Array | None:
