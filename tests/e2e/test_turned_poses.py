@@ -56,6 +56,16 @@ def test_an_attitude_that_stays_wrong_ends_on_the_floor_inside(autopilot: str, t
     assert flight.outside_m < 0.0 and not flight.peers.autopilot.pilot.is_armed
 
 
+@pytest.mark.fault(99)
+@BOTH
+@pytest.mark.parametrize("turn", ["yaw-90", "yaw-180"])
+def test_a_heading_that_is_wrong_from_the_first_pose_on_ends_on_the_floor_inside(autopilot: str, turn: str) -> None:
+    """Nothing shows it before the vehicle moves; turned by 180°, its own position control drives it away."""
+    flight = TurnedPosesFlight(autopilot, turn, begin_s=None, wrong_s=300.0).fly(50.0)
+    assert flight.wrong_sent > 0 and flight.error_rad > math.radians(40.0)
+    assert flight.outside_m < 0.0 and not flight.peers.autopilot.pilot.is_armed
+
+
 @BOTH
 def test_a_right_attitude_is_never_kept_back(autopilot: str) -> None:
     flight = TurnedPosesFlight(autopilot, "right", "sim.wind.gust_wind_mps=3.0", begin_s=0.0, wrong_s=0.0).fly(40.0)

@@ -20,7 +20,7 @@ from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.acceleration import compute_lean_mps2
 from uavctl.flight.monitors.engaged import INITIAL
 from uavctl.flight.monitors.observation import Observation, select_axes
-from uavctl.flight.monitors.outside import describe_beyond, is_outside
+from uavctl.flight.monitors.outside import SIDEWAYS_MPS, describe_beyond, describe_sideways, is_outside
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
 
@@ -89,6 +89,18 @@ def test_being_beyond_a_limit_is_without_what_braking_needs(beyond_m: float, spe
     north = PARAMETERS.upper_m[0] + PARAMETERS.outside_m[0] + beyond_m
     ours = structs.replace(seen(AT_NS), position_m=(north, 0.0, -2.0), velocity_mps=(speed, 0.0, 0.0))
     assert bool(describe_beyond(ours, PARAMETERS)) == (beyond_m > 0.0 and speed > -0.3)
+
+
+@pytest.mark.fault(99)
+@pytest.mark.parametrize("by_itself", [True, False])
+def test_a_climb_that_is_not_upright_is_found_by_either_velocity(by_itself: bool) -> None:
+    """By the vehicle's own velocity where it is known, else by the estimate; without both nothing is known."""
+    for speed, is_found in ((SIDEWAYS_MPS, False), (just_more(SIDEWAYS_MPS), True)):
+        moved, other = (0.0, speed, -9.0), (9.0, 0.0, 0.0)
+        ours = seen(AT_NS, vehicle_motion=motion(moved, AT_NS) if by_itself else None)
+        known = structs.replace(ours, position_m=ZERO, velocity_mps=other if by_itself else moved)
+        assert bool(describe_sideways(known)) == is_found
+        assert bool(describe_sideways(ours)) == (is_found and by_itself)
 
 
 def test_being_outside_has_to_persist() -> None:
