@@ -41,9 +41,17 @@ class TurnedPosesFlight(TakeOffRig):
     """
 
     def __init__(
-        self, autopilot: str, turn: str, *more: str, begin_s: float | None, wrong_s: float, every_s: float = 0.0
+        self,
+        autopilot: str,
+        turn: str,
+        *more: str,
+        begin_s: float | None,
+        wrong_s: float,
+        every_s: float = 0.0,
+        plant: str = "quadrotor",
     ) -> None:
-        super().__init__(autopilot, *RELAYED, "sim.inertial.flown=true", *more)
+        flown = ["sim.inertial.flown=true"] if plant == "quadrotor" else []  # the linear plant is always level
+        super().__init__(autopilot, *RELAYED, f"sim.plant={plant}", *flown, *more)
         self.relayed()
         self._turn, self._begin_s, self._wrong_s, self._every_s = turn, begin_s, wrong_s, every_s
         self._flown_ns: int | None = None
