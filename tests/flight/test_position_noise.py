@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from uavctl.flight.monitors import jumps, noise
 from uavctl.flight.monitors.jumps import FADE_MPS, MAX_SHIFT_M, JumpTrack, Outcome
@@ -61,6 +63,18 @@ def test_noise_is_bounded_and_needs_positions_close_to_one_another() -> None:
     assert measure_noise(wild).std_m == LARGEST_STD_M
     far = measure_noise(wild, step_ns=4 * STEP_NS)
     assert not far.is_known and far.std_m == 0.0
+
+
+@given(st.lists(st.tuples(st.integers(1, 40), st.floats(-0.2, 0.2)), min_size=10, max_size=40))
+def test_positions_that_come_twice_or_too_late_are_no_noise(arrivals: list[tuple[int, float]]) -> None:
+    """The noise is that of the positions that are newer than all before."""
+    every, newer, newest = NoiseTrack(), NoiseTrack(), 0
+    for step, north in arrivals:
+        sample = make_sample(step * STEP_NS, (north, 0.0, 0.0))
+        every = noise.update(every, sample, sample.captured_ns)
+        if step > newest:
+            newer, newest = noise.update(newer, sample, sample.captured_ns), step
+    assert every == newer
 
 
 def take(track: JumpTrack, n: int, offset_m: Vec3, age_s: float = 0.05) -> tuple[JumpTrack, Outcome]:
@@ -138,3 +152,35 @@ def test_right_after_a_silence_nothing_is_a_jump() -> None:
     assert outcome is Outcome.COUNTS
     track, outcome = take(track, 51, JUMP)
     assert outcome is Outcome.COUNTS and track.shift_m == NONE
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=20))
+def test_while_others_fly_all_positions_count_in_full(offsets_m: list[float]) -> None:
+    """A shift from before is forgotten, too; afterwards jumps are judged again."""
+    track, _ = take(take(settle(), 30, JUMP)[0], 31, JUMP, 0.1)
+    assert track.shift_m != NONE
+    n = 32
+    for n, north in enumerate(offsets_m, start=32):
+        track = jumps.suspend(track, 10_000_000_000 + n * STEP_NS)
+        track, outcome = take(track, n, (north, 0.0, 0.0))
+        assert outcome is Outcome.COUNTS and track.compute_shift_m(track.seen_ns) == NONE
+    track, outcome = take(track, n + 1, NONE)
+    assert outcome is Outcome.COUNTS
+    track, outcome = take(track, n + 2, JUMP)
+    assert outcome is Outcome.REFUSED
+
+
+@given(st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), min_size=5, max_size=60))
+def test_no_positions_shift_by_more_than_so_much_and_no_three_are_refused_alike(
+    places: list[tuple[float, float]],
+) -> None:
+    """Each place is held for three positions: a source that stays is refused only if it is too far."""
+    track, n = settle(), 30
+    for north, east in places:
+        outcomes = []
+        for _ in range(3):
+            track, outcome = take(track, n, (north, east, 0.0))
+            outcomes.append(outcome)
+            n += 1
+            assert math.hypot(*track.shift_m) <= MAX_SHIFT_M
+        assert Outcome.TOO_FAR in outcomes or Outcome.COUNTS in outcomes
