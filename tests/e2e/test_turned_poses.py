@@ -16,13 +16,20 @@ pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
+# The heading does not matter to the linear plant, which is always level: what it does on wrong ones shows nothing.
+WORLDS = pytest.mark.parametrize(
+    ("autopilot", "plant"),
+    [(autopilot, plant) for plant in ("quadrotor", "linear") for autopilot in ("px4", "ardupilot")],
+)
+
+
 def find_attitude_events(memory: MemorySink) -> list[tuple[str, str]]:
     codes = (EventCode.RELAY_ATTITUDE, EventCode.RELAY_ATTITUDE_RIGHT)
     return [(event.code, event.subject) for event in memory.of(Event) if event.code in codes]
 
 
 @pytest.mark.fault(99)
-@BOTH
+@WORLDS
 @pytest.mark.parametrize(
     ("turn", "subject", "every_s"),
     [
@@ -34,9 +41,9 @@ def find_attitude_events(memory: MemorySink) -> list[tuple[str, str]]:
     ],
 )
 def test_a_flip_of_some_seconds_is_kept_from_the_vehicle_and_flown_through(
-    autopilot: str, turn: str, subject: str, every_s: float
+    autopilot: str, plant: str, turn: str, subject: str, every_s: float
 ) -> None:
-    flight = TurnedPosesFlight(autopilot, turn, begin_s=4.0, wrong_s=3.0, every_s=every_s).fly(20.0)
+    flight = TurnedPosesFlight(autopilot, turn, begin_s=4.0, wrong_s=3.0, every_s=every_s, plant=plant).fly(20.0)
     assert flight.wrong_sent == 0 and flight.error_rad < math.radians(10.0)
     assert find_attitude_events(flight.memory) == [
         (EventCode.RELAY_ATTITUDE, subject),
@@ -47,12 +54,22 @@ def test_a_flip_of_some_seconds_is_kept_from_the_vehicle_and_flown_through(
 
 
 @pytest.mark.fault(99)
-@BOTH
+@WORLDS
 @pytest.mark.parametrize("turn", ["yaw-180", "creep", "roll-180"])
-def test_an_attitude_that_stays_wrong_ends_on_the_floor_inside(autopilot: str, turn: str) -> None:
-    flight = TurnedPosesFlight(autopilot, turn, begin_s=4.0, wrong_s=300.0).fly(60.0)
+def test_an_attitude_that_stays_wrong_ends_on_the_floor_inside(autopilot: str, plant: str, turn: str) -> None:
+    flight = TurnedPosesFlight(autopilot, turn, begin_s=4.0, wrong_s=300.0, plant=plant).fly(60.0)
     assert flight.wrong_sent == 0 and flight.error_rad < math.radians(20.0)
     assert [code for code, _ in find_attitude_events(flight.memory)] == [EventCode.RELAY_ATTITUDE]
+    assert flight.outside_m < 0.0 and not flight.peers.autopilot.pilot.is_armed
+
+
+@pytest.mark.fault(99)
+@BOTH
+@pytest.mark.parametrize("turn", ["yaw-90", "yaw-180"])
+def test_a_heading_that_is_wrong_from_the_first_pose_on_ends_on_the_floor_inside(autopilot: str, turn: str) -> None:
+    """Nothing shows it before the vehicle moves; turned by 180°, its own position control drives it away."""
+    flight = TurnedPosesFlight(autopilot, turn, begin_s=None, wrong_s=300.0).fly(50.0)
+    assert flight.wrong_sent > 0 and flight.error_rad > math.radians(40.0)
     assert flight.outside_m < 0.0 and not flight.peers.autopilot.pilot.is_armed
 
 

@@ -20,7 +20,7 @@ from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.acceleration import compute_lean_mps2
 from uavctl.flight.monitors.engaged import INITIAL
 from uavctl.flight.monitors.observation import Observation, select_axes
-from uavctl.flight.monitors.outside import describe_beyond, is_outside
+from uavctl.flight.monitors.outside import SIDEWAYS_MPS, describe_beyond, describe_sideways, is_outside
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
 
@@ -91,6 +91,18 @@ def test_being_beyond_a_limit_is_without_what_braking_needs(beyond_m: float, spe
     assert bool(describe_beyond(ours, PARAMETERS)) == (beyond_m > 0.0 and speed > -0.3)
 
 
+@pytest.mark.fault(99)
+@pytest.mark.parametrize("by_itself", [True, False])
+def test_a_climb_that_is_not_upright_is_found_by_either_velocity(by_itself: bool) -> None:
+    """By the vehicle's own velocity where it is known, else by the estimate; without both nothing is known."""
+    for speed, is_found in ((SIDEWAYS_MPS, False), (just_more(SIDEWAYS_MPS), True)):
+        moved, other = (0.0, speed, -9.0), (9.0, 0.0, 0.0)
+        ours = seen(AT_NS, vehicle_motion=motion(moved, AT_NS) if by_itself else None)
+        known = structs.replace(ours, position_m=ZERO, velocity_mps=other if by_itself else moved)
+        assert bool(describe_sideways(known)) == is_found
+        assert bool(describe_sideways(ours)) == (is_found and by_itself)
+
+
 def test_being_outside_has_to_persist() -> None:
     out: Vec3 = (4.0, 0.0, -2.0)
     assert at(out, since_ns=None) is None
@@ -136,7 +148,11 @@ def braked(speeds: Iterator[tuple[int, float | None]], *, ends: Sequence[int] = 
         ([(0, 2.0), (1000, 1.91)], (), [1000]),
         ([(0, 0.0), (1000, 0.29)], (), []),
         ([(0, 0.0), (1000, 0.31)], (), [1000]),
-        ([(0, 2.0), (1000, 0.5), (1500, 1.92)], (), [1500]),
+        (
+            [(0, 2.0), (300, 1.6), (600, 1.2), (900, 0.8), (1200, 0.9), (1300, 1.3), (1400, 1.6), (1500, 1.92)],
+            (),
+            [1500],
+        ),
         ([(0, 2.0), (500, 2.0), (1000, 2.0), (1499, 2.0), (1500, 2.0)], (500,), []),
         ([(0, 2.0), (500, 2.0), (550, 2.0), (1549, 2.0), (1550, 2.0)], (500,), [1550]),
         ([(0, None), (400, 2.0), (1000, 2.0), (1400, 2.0)], (), [1400]),  # since it is known

@@ -541,6 +541,7 @@ def later(watching: MonitorState, by_ns: int) -> MonitorState:
     response_later = structs.replace(
         response,
         requested=moved(response.requested),
+        samples=moved(response.samples),
         inertial_ns=None if inertial_ns is None else inertial_ns + by_ns,
         velocity=None if own is None else (own[0] + by_ns, own[1]),
     )

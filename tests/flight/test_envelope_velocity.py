@@ -234,6 +234,25 @@ def test_smoothing_explains_a_change_of_offsets_with_the_velocity(
     assert (breach is not None) == breached
 
 
+@pytest.mark.parametrize(
+    ("late_s", "drift_mps", "breached"), [(0.29, 0.0, False), (0.0, 0.09, False), (0.0, 0.12, True), (0.29, 0.12, True)]
+)
+@pytest.mark.fault(42)
+def test_a_drift_in_motion_is_no_smoothing(late_s: float, drift_mps: float, breached: bool) -> None:
+    """At rest now; for 8 s before, the vehicle flew at 1 m/s and at 2 m/s in turn, by its own word.
+
+    A delay of 0.3 s would explain 0.3 m or 0.6 m of each place alone, but not all of them.
+    """
+    known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
+    flown = [(ago_s, 1.0 + ago_s % 2) for ago_s in range(8, 0, -1)]
+    places = tuple(
+        (AT_NS - 256 * MS - ago_s * SECOND_NS, (-late_s * v - drift_mps * ago_s, 0.0, 0.0), (v, 0.0, 0.0))
+        for ago_s, v in flown
+    )
+    _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **known)
+    assert (breach is not None) == breached
+
+
 def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
     _, breach = creeping(9.0, SECOND_NS, before=3)
     assert breach is not None and breach.cause == EventCode.VELOCITY

@@ -301,7 +301,7 @@ def test_the_cause_says_where_the_speed_allowed_no_stop(north_m: float, north_mp
 
 
 def test_a_gap_in_inertial_data_begins_anew() -> None:
-    last = (float(START_NS), 1.0, *[0.0] * 9)
+    last = START_NS, (1.0, *[0.0] * 9)
     state = ResponseState(
         requested=((START_NS, ZERO),), inertial_ns=START_NS, samples=(last,), recent=(1.0, *[0.0] * 6)
     )

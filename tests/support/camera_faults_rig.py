@@ -7,7 +7,7 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from deception_rig import DeceivedFlight, fly_deceived, prepare_believed
+from deception_rig import DeceivedFlight, choose_plant, fly_deceived, prepare_believed
 
 from sim.cameras import Cameras
 from sim.simulation import World
@@ -104,7 +104,9 @@ def distort_cameras(cameras: Cameras, kind: str, seed: int) -> None:
     cameras.capture = capture_distorted  # type: ignore[method-assign]
 
 
-def draw_pair(seed: int, preset: str, autopilot: str, *more: str) -> tuple[Config, Config, Controller]:
+def draw_pair(
+    seed: int, preset: str, autopilot: str, *more: str, plant: str = "quadrotor"
+) -> tuple[Config, Config, Controller]:
     """Draw a flight between the corners of a room in gusts of 3 m/s: its world, and what the controller believes."""
     rng = np.random.default_rng([seed, 41])
     believed, _ = prepare_believed(preset, autopilot, more)
@@ -116,15 +118,17 @@ def draw_pair(seed: int, preset: str, autopilot: str, *more: str) -> tuple[Confi
         sides = [(0.9 * lower[0], 0.9 * upper[1]), (0.9 * upper[0], 0.9 * lower[1])]
     waypoints = ", ".join(f"[{n:.2f}, {e:.2f}, {height_m:.2f}]" for n, e in [*sides, *sides, *sides, *sides])
     mission = f"mission.waypoints=[{waypoints}]"
-    world = [f"sim.autopilot={autopilot}", f"sim.seed={seed}", "sim.plant=quadrotor", mission]
-    world += ["sim.wind.gust_wind_mps=3.0", f"duration_s={DURATION_S}", *more]
+    world = [f"sim.autopilot={autopilot}", f"sim.seed={seed}", *choose_plant(plant, 3.0), mission]
+    world += [f"duration_s={DURATION_S}", *more]
     believed, controller = prepare_believed(preset, autopilot, (mission, *more))
     return load_config(preset, world), believed, controller
 
 
-def fly_with_fault(kind: str, seed: int, preset: str, autopilot: str, *more: str) -> DeceivedFlight:
+def fly_with_fault(
+    kind: str, seed: int, preset: str, autopilot: str, *more: str, plant: str = "quadrotor"
+) -> DeceivedFlight:
     """Fly with an everyday fault of the cameras; an empty kind is none."""
-    config, believed, controller = draw_pair(seed, preset, autopilot, *more)
+    config, believed, controller = draw_pair(seed, preset, autopilot, *more, plant=plant)
 
     def prepare(world: World) -> None:
         if kind:

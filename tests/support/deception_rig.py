@@ -279,8 +279,19 @@ def _choose_autopilot(seed: int) -> tuple[str, str]:
     return autopilot, (f"room-{autopilot}", f"room-{autopilot}", "room")[(seed // 2) % 3]
 
 
+def choose_plant(plant: str, gust_wind_mps: float) -> tuple[str, ...]:
+    """Choose the plant of a world; the linear one has its own disturbance in place of wind."""
+    return f"sim.plant={plant}", *([f"sim.wind.gust_wind_mps={gust_wind_mps:.2f}"] if plant == "quadrotor" else [])
+
+
 def _load_world(
-    seed: int, rng: np.random.Generator, waypoints: str, duration_s: float, overrides: Sequence[str] = ()
+    seed: int,
+    rng: np.random.Generator,
+    waypoints: str,
+    duration_s: float,
+    overrides: Sequence[str] = (),
+    *,
+    plant: str = "quadrotor",
 ) -> Config:
     """Load the configuration of the world that is flown in, with gusts."""
     autopilot, preset = _choose_autopilot(seed)
@@ -289,9 +300,8 @@ def _load_world(
         [
             f"sim.autopilot={autopilot}",
             f"sim.seed={seed}",
-            "sim.plant=quadrotor",
+            *choose_plant(plant, float(rng.uniform(0.0, 3.0))),
             f"mission.waypoints=[{waypoints}]",
-            f"sim.wind.gust_wind_mps={rng.uniform(0.0, 3.0):.2f}",
             f"duration_s={duration_s}",
             *overrides,
         ],
@@ -310,7 +320,7 @@ def _draw_waypoints(rng: np.random.Generator, preset: str, autopilot: str) -> st
     return ", ".join(f"[{n:.2f}, {e:.2f}, {height:.2f}]" for n, e in corners)
 
 
-def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float]:
+def draw_flight(seed: int, plant: str = "quadrotor") -> tuple[Config, Config, Controller, list[Deception], float]:
     """Draw a flight: preset, autopilot, gusts, path between walls, a blackout, and one or two deceptions."""
     rng = np.random.default_rng([seed, 39])
     autopilot, preset = _choose_autopilot(seed)
@@ -327,7 +337,7 @@ def draw_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception],
         for source in sources
     ]
     blackout = f"link.blackout=[[{blackout_s}, {blackout_s + BLACKOUT_S}]]"
-    config = _load_world(seed, rng, waypoints, blackout_s + BLACKOUT_S + AFTER_S, (blackout,))
+    config = _load_world(seed, rng, waypoints, blackout_s + BLACKOUT_S + AFTER_S, (blackout,), plant=plant)
     believed, controller = prepare_believed(preset, autopilot, (f"mission.waypoints=[{waypoints}]",))
     return config, believed, controller, deceptions, blackout_s
 

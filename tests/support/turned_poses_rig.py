@@ -30,7 +30,7 @@ class TurnedPosesFlight(TakeOffRig):
 
     Args:
         turn: A key of `TURNS_DEG`.
-        begin_s: When the attitude begins to be wrong, since the vehicle began to be flown [s].
+        begin_s: When the attitude begins to be wrong, since the vehicle began to be flown [s]; None for the first pose.
         wrong_s: For how long [s].
         every_s: The wrong attitude lasts for half of each such period [s]; 0 for all the time.
 
@@ -41,9 +41,17 @@ class TurnedPosesFlight(TakeOffRig):
     """
 
     def __init__(
-        self, autopilot: str, turn: str, *more: str, begin_s: float, wrong_s: float, every_s: float = 0.0
+        self,
+        autopilot: str,
+        turn: str,
+        *more: str,
+        begin_s: float | None,
+        wrong_s: float,
+        every_s: float = 0.0,
+        plant: str = "quadrotor",
     ) -> None:
-        super().__init__(autopilot, *RELAYED, "sim.inertial.flown=true", *more)
+        flown = ["sim.inertial.flown=true"] if plant == "quadrotor" else []  # the linear plant is always level
+        super().__init__(autopilot, *RELAYED, f"sim.plant={plant}", *flown, *more)
         self.relayed()
         self._turn, self._begin_s, self._wrong_s, self._every_s = turn, begin_s, wrong_s, every_s
         self._flown_ns: int | None = None
@@ -52,9 +60,11 @@ class TurnedPosesFlight(TakeOffRig):
         self.hears = self._count_wrong
 
     def fly(self, seconds: float) -> TurnedPosesFlight:
-        """Take off by order, fly to the goal, and on for a time."""
+        """Take off by order, fly to the goal, and on for a time; poses wrong from the first on leave only the time."""
         self.run(8.0)
-        self.take_off().run(60.0, until=HandoverState.ENGAGED)
+        self.take_off()
+        if self._begin_s is not None:
+            self.run(60.0, until=HandoverState.ENGAGED)
         self._flown_ns = self.now_ns
         for _ in range(round(seconds * 20)):
             if self.loop.finished:
@@ -71,9 +81,12 @@ class TurnedPosesFlight(TakeOffRig):
         return math.dist(self.peers.vehicle.position_m, GOAL)
 
     def _find_turn_deg(self, at_ns: int) -> Vec3 | None:
-        if self._flown_ns is None:
+        if self._begin_s is None:
+            since_s = at_ns / SECOND
+        elif self._flown_ns is None:
             return None
-        since_s = (at_ns - self._flown_ns) / SECOND - self._begin_s
+        else:
+            since_s = (at_ns - self._flown_ns) / SECOND - self._begin_s
         if not 0.0 <= since_s < self._wrong_s or (self._every_s and since_s % self._every_s > self._every_s / 2):
             return None
         roll, pitch, yaw = TURNS_DEG[self._turn]

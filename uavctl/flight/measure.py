@@ -334,9 +334,13 @@ def _judge_jump(
     spread_m = np.sqrt(belief.cov.diagonal()[index] + compute_position_variance(kalman.parameters, counted))
     north, east, down = offset_m
     age_s = (at_ns - belief.captured_ns) * 1e-9
-    track, is_refused = jumps.update(sources.jumps, (north, east, down), spread_m, at_ns, age_s)
+    track, outcome = jumps.update(sources.jumps, (north, east, down), spread_m, at_ns, age_s)
     sources = replace(sources, jumps=track)
-    return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_JUMP) if is_refused else NO_VERDICT
+    if outcome is jumps.Outcome.COUNTS:
+        return sources, NO_VERDICT
+    if outcome is jumps.Outcome.TOO_FAR:
+        sources = replace(sources, outliers=OutlierTrack(at_ns, at_ns, 1, offset[:n_axes]))
+    return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_JUMP)
 
 
 def _is_flying(vehicle: VehicleStatus | None) -> bool:

@@ -434,4 +434,6 @@ def _describe_unsafe(view: FilterView, context: TickContext) -> str:
         return f"no position has come for {controller.horizon * controller.plant.dt_s:.1f} s"
     if controller.envelope is None:
         return ""
-    return outside.describe_beyond(observe_motion(view.estimate, context, ZERO), controller.envelope)
+    observation = observe_motion(view.estimate, context, ZERO)
+    sideways = outside.describe_sideways(observation) if context.is_climbing_or_landing else ""
+    return sideways or outside.describe_beyond(observation, controller.envelope)

@@ -10,12 +10,13 @@
 
 While others fly the vehicle nothing is a jump: its own climb and landing must end at once where positions are wrong.
 A wrong frame, another body or a marker that came loose makes errors that grow with time or jump further: they are not
-shifted.
+shifted. A jump that goes further and is confirmed is one for the monitor `uavctl.flight.monitors.outliers`.
 """
 
 from __future__ import annotations
 
 import math
+from enum import Enum
 
 import msgspec
 from msgspec.structs import replace
@@ -35,6 +36,14 @@ GROWN_PART = 0.75
 SAME_PART = 0.4
 MAX_SHIFT_M = 0.4  # two solutions are 0.1 to 0.3 m apart
 FADE_MPS = 0.05  # a fifth of the difference of velocities that ends a flight
+
+
+class Outcome(Enum):
+    """What becomes of a position."""
+
+    COUNTS = "counts"
+    REFUSED = "refused"  # it may have jumped
+    TOO_FAR = "too far"  # it is confirmed to have jumped, further than positions are shifted; it is refused
 
 
 class JumpTrack(msgspec.Struct, frozen=True):
@@ -70,8 +79,8 @@ def suspend(track: JumpTrack, at_ns: int) -> JumpTrack:
     return JumpTrack(seen_ns=track.seen_ns, settled_ns=max(track.settled_ns, at_ns + 1))
 
 
-def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s: float) -> tuple[JumpTrack, bool]:
-    """Take a position inside the gate, which was noted; return too whether it is refused.
+def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s: float) -> tuple[JumpTrack, Outcome]:
+    """Take a position inside the gate, which was noted; return too what becomes of it.
 
     Args:
         offset_m: Position less the shift and the prediction.
@@ -80,12 +89,12 @@ def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s:
     """
     jump_m = track.jump_m
     if at_ns < track.settled_ns:
-        return replace(track, offset_m=offset_m, jump_m=None), False
+        return replace(track, offset_m=offset_m, jump_m=None), Outcome.COUNTS
     if jump_m is not None and math.dist(offset_m, jump_m) <= SAME_PART * math.hypot(*offset_m):
-        return _confirm_jump(track, offset_m, jump_m, at_ns), False
+        return _confirm_jump(track, offset_m, jump_m, at_ns)
     if _is_jump(track, offset_m, spread_m, age_s):
-        return replace(track, jump_m=offset_m), True
-    return replace(track, offset_m=offset_m, jump_m=None), False
+        return replace(track, jump_m=offset_m), Outcome.REFUSED
+    return replace(track, offset_m=offset_m, jump_m=None), Outcome.COUNTS
 
 
 def _is_jump(track: JumpTrack, offset_m: Vec3, spread_m: Array, age_s: float) -> bool:
@@ -101,11 +110,11 @@ def _is_jump(track: JumpTrack, offset_m: Vec3, spread_m: Array, age_s: float) ->
     return not grows
 
 
-def _confirm_jump(track: JumpTrack, offset_m: Vec3, jump_m: Vec3, at_ns: int) -> JumpTrack:
+def _confirm_jump(track: JumpTrack, offset_m: Vec3, jump_m: Vec3, at_ns: int) -> tuple[JumpTrack, Outcome]:
     """Add a jump to the shift, as far as that may go."""
     # s = s + (ν_0 + ν) / 2
     rows = zip(track.compute_shift_m(at_ns), offset_m, jump_m, strict=True)
     north, east, down = (shift + 0.5 * (now + before) for shift, now, before in rows)
     if math.hypot(north, east, down) > MAX_SHIFT_M:
-        return replace(track, offset_m=offset_m, jump_m=None)
-    return replace(track, shift_m=(north, east, down), at_ns=at_ns, offset_m=ZERO, jump_m=None)
+        return replace(track, jump_m=None), Outcome.TOO_FAR
+    return replace(track, shift_m=(north, east, down), at_ns=at_ns, offset_m=ZERO, jump_m=None), Outcome.COUNTS

@@ -3,6 +3,7 @@
 1. Each side of each axis: is the estimate beyond the limit by more than the margin, and not on its way back?
 2. Would the distance to stop end beyond the margin?
 3. One of both holds for 0.1 s. Then: end the plans.
+4. A vehicle that climbs by itself flies sideways. Then: break the climb off.
 
 False alarms (docs/soak.md): 0 of 200 missions.
 """
@@ -16,11 +17,12 @@ import msgspec
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import AXES
 from uavctl.flight.monitors.motion import TickObservation
-from uavctl.flight.monitors.observation import EnvelopeParameters, Observation
+from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, read_vehicle_velocity
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 
 LASTS_NS = 100_000_000  # one estimate alone may be a late sample's fault
 RETURNS_MPS = 0.3  # a vehicle outside that moves so fast towards the limit is on its way back
+SIDEWAYS_MPS = 0.6  # upright climbs in gusts of 5 m/s came to 0.25 m/s
 REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
 
 
@@ -38,6 +40,21 @@ def update(state: OutsideState, observation: TickObservation) -> tuple[OutsideSt
     since_ns = state.since_ns or observation.tick.at_ns
     lasts = observation.tick.at_ns - since_ns >= LASTS_NS
     return OutsideState(since_ns), end_plans(EventCode.OUTSIDE, text) if lasts else NO_VERDICT
+
+
+def describe_sideways(observation: Observation) -> str:
+    """Return how fast a vehicle that climbs by itself flies sideways; empty where its climb is upright.
+
+    A wrong heading turns the corrections of its own position control, so that they drive it away.
+    """
+    # Its own velocity first: positions may be lost in a burst meanwhile, and a jump of positions makes no such speed.
+    own = read_vehicle_velocity(observation.motion, observation.at_ns)
+    if own is None and observation.position_m is None:
+        return ""
+    speed_mps = math.hypot(*(own or observation.velocity_mps)[:2])
+    if speed_mps <= SIDEWAYS_MPS:
+        return ""
+    return f"it flies sideways at {speed_mps:.1f} m/s in its climb: its heading may be wrong"
 
 
 def is_outside(observation: Observation, parameters: EnvelopeParameters) -> bool:

@@ -56,6 +56,7 @@ LITTLE = 5.0
 # Factor of the bounds for the vehicle's own velocity, which its estimator smooths, and without positions for so long:
 # inertial data and the own velocity that begin to err together would be taken for a wrong response.
 UNCERTAIN, SILENT_NS = 3.0, 400_000_000
+WITNESSED = 2.5  # the same where positions are the witness: sudden winds of 5 to 8 m/s² make evidence of up to 7.4
 # Of the acceleration that positions may show unexplained: from there on they are witness of inertial data. A choice:
 # more than noise of positions shows, less than a wrong response does in half a second.
 WITNESSED_PART = 0.3
@@ -68,8 +69,8 @@ REQUESTED_NS = WINDOW_NS + TOO_LATE_NS + MOTION_NS  # setpoints are kept for so 
 _TIME = itemgetter(0)
 _LIMITS = (("south", "north"), ("west", "east"), ("upper", "lower"))
 
-# A sample: time [ns] and weight; acceleration, that by setpoints, and velocity, each (3,)
-Sample = tuple[float, ...]
+# A sample: time [ns]; weight, then acceleration, that by setpoints, and velocity, each (3,)
+Sample = tuple[int, tuple[float, ...]]
 
 
 class _Group:
@@ -154,10 +155,13 @@ def update(
     by_inertial = tick.inertial_mps2 is not None
     observer = observation.motion.observer
     is_silent = observer is None or tick.at_ns - observer.at_ns > SILENT_NS
-    if by_inertial and not change.supports_velocity(tick.at_ns) and (is_silent or not _is_witnessed(observation)):
+    is_supported = change.supports_velocity(tick.at_ns)
+    if by_inertial and not is_supported and (is_silent or not _is_witnessed(observation)):
         return state, NO_VERDICT
     evidence, kind = compute_evidence(state, observation.parameters.unexplained_mps2)
-    factor = 1.0 if by_inertial and not is_silent else UNCERTAIN
+    factor = UNCERTAIN
+    if by_inertial and not is_silent:
+        factor = 1.0 if is_supported else WITNESSED
     if evidence <= factor * NEAR or evidence <= factor * _compute_bound(tick, observation.parameters):
         return state, NO_VERDICT
     text = f"the vehicle does not answer setpoints as they say ({kind}), or a strong wind has set in"
@@ -212,7 +216,7 @@ def _add_sample(state: ResponseState, shown: _Acceleration, tick: Observation) -
     left = [a - u for a, u in zip(shown.accel_mps2, now, strict=True)]
     kept, kept_long = math.exp(-shown.span_s / MEMORY_S), math.exp(-shown.span_s / BASELINE_S)
     recent, baseline = (1.0, *left, *(e * e for e in left)), (1.0, *left, *velocity)
-    sample = (float(shown.middle_ns), weight, *shown.accel_mps2, *now, *velocity)
+    sample = shown.middle_ns, (weight, *shown.accel_mps2, *now, *velocity)
     first = bisect_right(state.samples, shown.middle_ns - WINDOW_NS, key=_TIME)
     return replace(
         state,
@@ -260,15 +264,16 @@ def _compute_cost(count: float, variance: float, jumped: float, noise_mps2: floa
 
 def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_mps2: float) -> list[float]:
     """Compute the negative log-likelihood of each hypothesis of a group."""
-    samples, axes = np.array(state.samples), group.axes
-    at_ns, requested_ns = samples[:, 0], np.array([float(ns) for ns, _ in state.requested])
+    samples, axes, newest_ns = np.array([numbers for _, numbers in state.samples]), group.axes, state.samples[-1][0]
+    # Relative to the newest sample: a difference of two is exact.
+    at_ns, requested_ns = (np.array([ns - newest_ns for ns, _ in rows]) for rows in (state.samples, state.requested))
     requested = np.array([u for _, u in state.requested])[:, axes]
     delayed = [
         requested[np.maximum(np.searchsorted(requested_ns, at_ns - ns, side="right") - 1, 0)]
         for ns in (LATE_NS, TOO_LATE_NS)
     ]
-    accel, now, velocity = (samples[:, [first + axis for axis in axes]] for first in (2, 5, 8))
-    weights = samples[:, 1] * np.exp((at_ns - at_ns[-1]) * (1e-9 / MEMORY_S))
+    accel, now, velocity = (samples[:, [first + axis for axis in axes]] for first in (1, 4, 7))
+    weights = samples[:, 0] * np.exp(at_ns * (1e-9 / MEMORY_S))
     count = float(weights.sum())
     weights = weights / count
     # e = a - R u: (k, n, d)

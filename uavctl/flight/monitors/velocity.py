@@ -4,7 +4,8 @@
 2. The slope of the offsets over a second or so is the difference of both velocities. Stamps that are late explain a
    part that is the acceleration times the delay. What is left is compared with its bound. Then: end the plans.
 3. The mean offsets of half a minute show a frame that creeps: their change is compared with a bound that grows with
-   time. Smoothing in a camera system explains a part: a delay times the change of the velocity. Then: end the plans.
+   time. Smoothing in a camera system explains a part: one delay for all, times the change of the velocity. Then: end
+   the plans.
 4. Velocities contradicted each other, and then no position came for 0.6 s. Then: end the plans.
 5. The first position after a silence lies far from the vehicle's own way through it. Then: end the plans.
 6. While positions that have come back correct the vehicle's own velocity, no difference counts.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from operator import itemgetter
 
 import msgspec
@@ -46,6 +48,7 @@ SHORTEST = 0.3  # of the window: over less, two velocities are not compared
 PLACES_NS, PLACE_NS = 30_000_000_000, 1_000_000_000  # mean offsets are compared over so long, one for each such time
 # Of the disagreement: the bound of a change of offset begins with so many seconds of it, and grows by such a part.
 DRIFT_S, DRIFT_PART = 2.0, 0.16
+LEAST_PLACES = 4  # that tell a drift from the delay of smoothing
 LEAST_OFFSETS = 3  # for a slope
 NOISE_SIGMA = 4.0  # standard deviations of a slope that chance may make
 _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
@@ -55,6 +58,7 @@ Offsets = tuple[
 ]  # (capture time [ns], position minus the vehicle's own distance (3,)), in order
 
 Places = tuple[tuple[int, Vector, Vector], ...]  # (at_ns, mean offset (3,), own velocity (3,)) over the window
+Aligned = tuple[float, list[list[float]]]  # delay of smoothing [s], and the mean offsets (3,) without its part
 
 
 class VelocityState(msgspec.Struct, frozen=True, eq=False):
@@ -62,6 +66,7 @@ class VelocityState(msgspec.Struct, frozen=True, eq=False):
 
     offsets: Offsets = ()  # of the window
     places: Places = ()  # means of the offsets, one for each second or so
+    aligned: Aligned | None = None  # of these places; None for too few, or where it is to be found anew
     apart_mps: float | None = None  # difference of both velocities when last compared; None where it is not known
     is_contradicted: bool = False  # whether it was beyond its bound when last compared
     # Capture time from which it has been beyond its bound, as far as it counts [ns]; None while it is not
@@ -82,27 +87,28 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     elsewhere = _find_return(state.offsets, offsets, observation)
     if elsewhere is not None:
         s, off = elsewhere
-        text = (
-            f"positions came back {describe_vector(off)} m away from the vehicle's own way, after {s:.0f} s without any"
-        )
+        text = f"positions came back {describe_vector(off)} m away from the vehicle's own way, after {s:.0f} s"
         return replace(state, offsets=offsets), end_plans(EventCode.VELOCITY, text)
     points = np.array([point for _, point in offsets])
     slope = _fit_slope(offsets, points, parameters)
     if slope is None:
         # Over a gap the vehicle's own distance is not known so well.
         places = state.places if len(offsets) > 1 else ()
-        return replace(state, offsets=offsets, places=places, apart_mps=None, apart_ns=None), NO_VERDICT
+        aligned = state.aligned if places else None
+        return VelocityState(offsets, places, aligned, is_contradicted=state.is_contradicted), NO_VERDICT
     resumed_ns = observation.motion.resumed_ns
     corrects = resumed_ns is not None and at_ns - parameters.window_ns < resumed_ns + CORRECTS_NS
     span_s, (begin, middle, end) = _find_way(path, offsets)
     velocity = _find_mean_velocity(begin, end, span_s)
-    drift, places = (None, ()) if corrects else _find_drift(state.places, offsets, points, velocity, parameters)
+    drift, places, aligned = None, (), None
+    if not corrects:
+        drift, places, aligned = _find_drift(state, offsets, points, velocity, parameters)
     apart = _remove_delay(slope, begin, middle, end, span_s)
     apart_mps = math.hypot(*apart)
     bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, observation.std_m)
     is_contradicted = apart_mps > bound_mps
     apart_ns = (state.apart_ns or at_ns) if is_contradicted and not corrects else None
-    state = VelocityState(offsets, places, apart_mps, is_contradicted, apart_ns)
+    state = VelocityState(offsets, places, aligned, apart_mps, is_contradicted, apart_ns)
     plain = observation.is_hinted or apart_mps >= PLAIN * bound_mps
     if apart_ns is not None and (plain or at_ns - apart_ns >= PERSISTS_NS):
         text = f"positions move otherwise than the vehicle itself says, by {describe_vector(apart)} m/s"
@@ -117,10 +123,9 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
 def update_silence(state: VelocityState, observation: TickObservation) -> tuple[VelocityState, Verdict]:
     """Take a tick, after its positions: has a contradiction been left open for too long?"""
     at_ns = observation.tick.at_ns
-    if len(observation.motion.vehicle_path) < 2 and (
-        state.offsets or state.places
-    ):  # the distance has begun anew, or is unknown
-        state = replace(state, offsets=(), places=())
+    # The distance has begun anew, or is unknown.
+    if len(observation.motion.vehicle_path) < 2 and (state.offsets or state.places):
+        state = replace(state, offsets=(), places=(), aligned=None)
     if state.apart_ns is None or at_ns - state.apart_ns < UNRESOLVED_NS:
         return state, NO_VERDICT
     text = "positions moved otherwise than the vehicle itself says, and none has come since"
@@ -150,8 +155,8 @@ def _find_return(
 
 
 def _find_drift(
-    places: Places, offsets: Offsets, points: Array, velocity: Vector, parameters: EnvelopeParameters
-) -> tuple[tuple[float, list[float]] | None, Places]:
+    state: VelocityState, offsets: Offsets, points: Array, velocity: Vector, parameters: EnvelopeParameters
+) -> tuple[tuple[float, list[float]] | None, Places, Aligned | None]:
     """Find the time [s] in which offsets changed too much, and the change (3,) [m]; return too the places after it.
 
     Args:
@@ -161,20 +166,23 @@ def _find_drift(
     # ō = Σ o_i / n
     mean: Array = np.add.reduce(points, axis=0) / len(offsets)
     place: list[float] = mean.tolist()
-    places = places[bisect_right(places, at_ns - PLACES_NS, key=_TIME) :]
-    for since_ns, before, velocity_before in places:
+    places = state.places[bisect_right(state.places, at_ns - PLACES_NS, key=_TIME) :]
+    is_known = state.aligned is not None and len(places) == len(state.places)
+    aligned = state.aligned if is_known else _align(places)
+    for k, (since_ns, before, velocity_before) in enumerate(places):
         s = (at_ns - since_ns) * 1e-9
         # |ō - ō_0| > (2 s + 0.16 s) v_max
         bound_m = (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps
-        if math.dist(place, before) <= bound_m:
-            continue
-        off = [now - then for now, then in zip(place, before, strict=True)]
-        off = _remove_smoothing(off, [now - then for now, then in zip(velocity, velocity_before, strict=True)])
+        if aligned is None:
+            off = _remove_smoothing(_subtract(place, before), _subtract(velocity, velocity_before))
+        else:
+            # ō + τ v
+            off = _subtract([o + aligned[0] * v for o, v in zip(place, velocity, strict=True)], aligned[1][k])
         if math.hypot(*off) > bound_m:
-            return (s, off), places
+            return (s, off), places, aligned
     if not places or at_ns - places[-1][0] >= PLACE_NS:
-        places = (*places, (at_ns, tuple(place), velocity))
-    return None, places
+        places, aligned = (*places, (at_ns, tuple(place), velocity)), None
+    return None, places, aligned
 
 
 def _find_way(path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> tuple[float, list[Vector | None]]:
@@ -197,12 +205,36 @@ def _find_mean_velocity(begin: Vector | None, end: Vector | None, span_s: float)
 
 def _remove_smoothing(off: list[float], change_mps: list[float]) -> list[float]:
     """Return a change of offsets (3,) [m] without the part that smoothing makes of a change of the velocity (3,)."""
-    along = sum(v * v for v in change_mps)
-    if along == 0.0:
-        return off
-    # τ = -Δo' Δv / Δv' Δv, within [0, τ_max]; Δo + τ Δv
-    late_s = min(max(-sum(o * v for o, v in zip(off, change_mps, strict=True)) / along, 0.0), SMOOTHED_S)
+    late_s = _bound_delay_s(off, change_mps)
+    # Δo + τ Δv
     return [o + late_s * v for o, v in zip(off, change_mps, strict=True)]
+
+
+def _bound_delay_s(off: list[float], change_mps: list[float]) -> float:
+    """Return the delay [s] by which smoothing may explain most of a change of offsets (3,) by that of the velocity."""
+    along = sum([v * v for v in change_mps])
+    # τ = -Δo' Δv / Δv' Δv, within [0, τ_max]
+    delay_s = -sum([o * v for o, v in zip(off, change_mps, strict=True)]) / along if along > 0.0 else 0.0
+    return min(max(delay_s, 0.0), SMOOTHED_S)
+
+
+def _align(places: Places) -> Aligned | None:
+    """Find the one delay [s] by which smoothing explains all mean offsets, and those without it; None from too few."""
+    if len(places) < LEAST_PLACES:
+        return None
+    times_s = np.array([(at_ns - places[0][0]) * 1e-9 for at_ns, _, _ in places])
+    values = np.array([(*offset, *velocity) for _, offset, velocity in places])
+    # o' = o - ō - t' (Σ t' o / Σ t'²), and v' alike: without their lines in time, which a drift makes
+    centred = times_s - np.add.reduce(times_s) / len(places)
+    beside = values - np.add.reduce(values, axis=0) / len(places)
+    beside -= np.outer(centred, centred @ beside / float(centred @ centred))
+    late_s = _bound_delay_s(beside[:, :3].ravel().tolist(), beside[:, 3:].ravel().tolist())
+    # ō + τ v
+    return late_s, (values[:, :3] + late_s * values[:, 3:]).tolist()
+
+
+def _subtract(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    return [x - y for x, y in zip(a, b, strict=True)]
 
 
 def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) -> Array | None:
