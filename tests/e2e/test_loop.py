@@ -17,7 +17,7 @@ from uavctl.event_codes import EventCode
 from uavctl.loop import MAX_SAMPLES
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.encoder import UnsendableError
-from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover import NEW_HEARTBEAT_NS, HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.records import Command, ControlMode, Datagram, Event, Order, Outgoing, Setpoint, SetpointSource, StepInput
 
@@ -216,8 +216,9 @@ def test_landing_is_asked_for_again_by_the_heartbeats_and_five_times_at_most() -
     commands = [(d.at_ns, decode(d.data)[0]) for d in rig.memory.of(Datagram) if d.outgoing]
     asked = [at_ns for at_ns, message in commands if message.get_type() == LAND and not is_stream_request(message)]
     first, *again = [at_ns // 50_000_000 for at_ns in asked]
-    # Right after the first heartbeat that comes a second later; the next ones come with the heartbeats.
-    expected = next(beat for beat in beats if beat >= first + 20)
+    # A second later, right after a heartbeat; the next ones come with the heartbeats.
+    new_ticks = NEW_HEARTBEAT_NS // 50_000_000
+    expected = next(tick for beat in beats for tick in range(beat, beat + new_ticks + 1) if tick >= first + 20)
     assert again == [expected + 20 * n for n in range(4)]
     assert rig.loop.finished
 

@@ -88,7 +88,8 @@ def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s:
         age_s: Time since the newest position that counted.
     """
     jump_m = track.jump_m
-    if at_ns < track.settled_ns:
+    # Where none has counted for so long, the estimate may be wrong.
+    if at_ns < track.settled_ns or age_s * 1e9 > SILENCE_NS:
         return replace(track, offset_m=offset_m, jump_m=None), Outcome.COUNTS
     if jump_m is not None and math.dist(offset_m, jump_m) <= SAME_PART * math.hypot(*offset_m):
         return _confirm_jump(track, offset_m, jump_m, at_ns)
