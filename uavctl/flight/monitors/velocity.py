@@ -169,15 +169,17 @@ def _find_drift(
     places = state.places[bisect_right(state.places, at_ns - PLACES_NS, key=_TIME) :]
     is_known = state.aligned is not None and len(places) == len(state.places)
     aligned = state.aligned if is_known else _align(places)
+    # ō + τ v
+    now = place if aligned is None else [o + aligned[0] * v for o, v in zip(place, velocity, strict=True)]
     for k, (since_ns, before, velocity_before) in enumerate(places):
-        s = (at_ns - since_ns) * 1e-9
+        s, then = (at_ns - since_ns) * 1e-9, before if aligned is None else aligned[1][k]
         # |ō - ō_0| > (2 s + 0.16 s) v_max
         bound_m = (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps
+        if math.dist(now, then) <= bound_m:
+            continue
+        off = _subtract(now, then)
         if aligned is None:
-            off = _remove_smoothing(_subtract(place, before), _subtract(velocity, velocity_before))
-        else:
-            # ō + τ v
-            off = _subtract([o + aligned[0] * v for o, v in zip(place, velocity, strict=True)], aligned[1][k])
+            off = _remove_smoothing(off, _subtract(velocity, velocity_before))
         if math.hypot(*off) > bound_m:
             return (s, off), places, aligned
     if not places or at_ns - places[-1][0] >= PLACE_NS:
