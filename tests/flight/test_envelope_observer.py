@@ -531,9 +531,11 @@ def later(watching: MonitorState, by_ns: int) -> MonitorState:
     rows = {name: moved(at(group, name)) for group, name in pairs}
     change = watching.velocity_change
     names_of_change = ("agreed_ns", "disagrees_ns", "velocity_wrong_ns", "inertial_wrong_ns")
-    change_times = {
+    change_times: dict[str, Any] = {
         name: getattr(change, name) + by_ns for name in names_of_change if getattr(change, name) is not None
     }
+    if change.repeated is not None:
+        change_times["repeated"] = (*change.repeated[:2], change.repeated[2] + by_ns)
     change_later = structs.replace(
         change, samples=tuple((one[0] + by_ns, *one[1:]) for one in change.samples), **change_times
     )

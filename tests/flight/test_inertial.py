@@ -490,7 +490,7 @@ def test_a_fallback_holds_by_inertial_data_against_a_force_that_it_would_not_kno
 
 
 def swing(late_s: float) -> list[TickOutput]:
-    """Ticks of a vehicle that swings; its positions come late by so much from 2 s on, and two other sources do not."""
+    """Ticks of a vehicle that swings; its positions, which are just back, are so late from 2 s on, two sources not."""
     envelope = replace(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3)
     controller = replace(controller_that_feels(bias_max=3.0, bias_drift=3.0), envelope=envelope)
     # a = A cos(ω t), v = A/ω sin(ω t), p = A/ω² (1 - cos(ω t))
@@ -509,6 +509,10 @@ def swing(late_s: float) -> list[TickOutput]:
             inertial=felt_at(at_ns - MS, accel_mps2 * math.cos(omega * s)),
         )
         state, one = run_tick(state, given, controller)
+        if not tick:
+            engaged = state.monitors.engaged
+            engaged = msgspec.structs.replace(engaged, motion=msgspec.structs.replace(engaged.motion, resumed_ns=at_ns))
+            state = msgspec.structs.replace(state, monitors=msgspec.structs.replace(state.monitors, engaged=engaged))
         told.append(one)
     return told
 

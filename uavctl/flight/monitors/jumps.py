@@ -30,6 +30,7 @@ LEAST_JUMP_M, JUMP_SIGMA = 0.07, 5.0  # an innovation beyond both may be a jump
 ERROR_MPS, ERROR_MPS2, LARGEST_ERROR_M = 0.3, 3.0, 0.25
 # After a longer silence, and for as long again, but no longer than a second, positions correct the estimate.
 SILENCE_NS, LONGEST_NS = 500_000_000, 1_000_000_000
+LOST_S = 1.5  # where none has counted for so long, the estimate may be wrong: a burst of 20 outliers takes a second
 # A wrong acceleration makes offsets that grow: the one before is at least so large a part of its change.
 GROWN_PART = 0.75
 # The next position is as far away, by this part: a wrong acceleration makes four times as much in twice the time.
@@ -88,8 +89,7 @@ def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s:
         age_s: Time since the newest position that counted.
     """
     jump_m = track.jump_m
-    # Where none has counted for so long, the estimate may be wrong.
-    if at_ns < track.settled_ns or age_s * 1e9 > SILENCE_NS:
+    if at_ns < track.settled_ns or age_s > LOST_S:
         return replace(track, offset_m=offset_m, jump_m=None), Outcome.COUNTS
     if jump_m is not None and math.dist(offset_m, jump_m) <= SAME_PART * math.hypot(*offset_m):
         return _confirm_jump(track, offset_m, jump_m, at_ns)

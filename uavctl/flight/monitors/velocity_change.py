@@ -36,7 +36,8 @@ PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one messa
 INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 RECENT_NS = 300_000_000  # an agreement counts for so long
-LEAP = 2.0  # disagreements between two messages: no force changes a velocity by more in so short a time
+# Leap from one message to the next: so many disagreements, and what a turned response makes of the largest setpoints.
+LEAP, LEAP_MPS2 = 2.0, 6.0
 _TIME = itemgetter(0)  # of samples, oldest first
 
 Sample = tuple[int, Vector, Vector, Vector]  # time [ns]; own velocity, integral of inertial data, model's [m/s]
@@ -48,7 +49,7 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     samples: tuple[Sample, ...] = ()  # of the window, oldest first
     agreed_ns: int | None = None  # when both changes last agreed [ns]; None before
     disagrees_ns: int | None = None  # time since which they do not [ns]; None while they do
-    repeated: tuple[Vector, Vector] | None = None  # the own velocity when it first came, and the model's then
+    repeated: tuple[Vector, Vector, int] | None = None  # the own velocity, the model's when it first came, that time
     velocity_wrong_ns: int | None = None  # when the own velocity was found wrong [ns]; None while it is not
     inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
 
@@ -72,7 +73,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     is_corrected = motion.resumed_ns is not None and tick.at_ns < motion.resumed_ns + CORRECTS_NS
     if own is None or own_ns is None or is_corrected:
         return replace(state, samples=(), disagrees_ns=None, repeated=None)
-    state = _judge_alone(state, own, motion.model_mps, tick.at_ns, parameters)
+    state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
     if not motion.inertial_path or tick.inertial_mps2 is None:
         return replace(state, samples=(), disagrees_ns=None)
     if state.samples and state.samples[-1][0] >= own_ns:
@@ -126,19 +127,23 @@ def _compare(
 
 
 def _judge_alone(
-    state: VelocityChangeState, own: Vector, model: Vector, at_ns: int, parameters: EnvelopeParameters
+    state: VelocityChangeState, shown: tuple[Vector, Vector, int], at_ns: int, parameters: EnvelopeParameters
 ) -> VelocityChangeState:
-    """Find an own velocity that repeats to the last bit while that by the setpoints changes, or that leaps."""
+    """Find an own velocity that repeats to the last bit while that by the setpoints changes, or that leaps.
+
+    Args:
+        shown: The own velocity, the model's, and its time [ns].
+    """
     if state.repeated is None:
-        return replace(state, repeated=(own, model))
-    before, model_before = state.repeated
-    # Repeats: |Δm| > v_max; leaps: |Δv - Δm| > 2 v_max
+        return replace(state, repeated=shown)
+    (own, model, own_ns), (before, model_before, before_ns) = shown, state.repeated
+    # Repeats: |Δm| > v_max; leaps: |Δv - Δm| > 2 v_max + 6 m/s² Δt
     if own == before:
         is_wrong = math.dist(model, model_before) > parameters.disagreement_mps
     else:
         off_mps = math.dist(_subtract(own, before), _subtract(model, model_before))
-        is_wrong = off_mps > LEAP * parameters.disagreement_mps
-        state = replace(state, repeated=(own, model))
+        is_wrong = off_mps > LEAP * parameters.disagreement_mps + LEAP_MPS2 * (own_ns - before_ns) * 1e-9
+        state = replace(state, repeated=shown)
     if not is_wrong or state.velocity_wrong_ns is not None:
         return state
     return replace(state, velocity_wrong_ns=at_ns)
