@@ -137,9 +137,10 @@ def test_a_stream_finds_its_way_after_garbage() -> None:
 
 def test_what_we_send_is_signed() -> None:
     ours, theirs = make_gate(), SignedPeer()
-    messages = theirs.mav.parse_buffer(ours.sign_frame(Peer(245, 25).heartbeat(), SECOND)) or []
-    (message,) = messages
-    assert message.get_signed()
+    peer = Peer(245, 25)
+    for frame in (ours.sign_frame(peer.heartbeat(), SECOND), ours.sign_ahead(peer.heartbeat(), 2 * SECOND)):
+        (message,) = theirs.mav.parse_buffer(frame) or []
+        assert message.get_signed()
 
 
 @pytest.mark.fault(36)
