@@ -39,9 +39,10 @@ PLAIN = 1.5  # this many times the bound is beyond it at once
 # velocity, which is wrong for this time: by up to 1.0 m/s for 0.8 s after 4 s, in flights.
 CORRECTS_NS = 1_000_000_000
 UNRESOLVED_NS = 600_000_000  # longest time without positions after a contradiction
-# Of the first position after a silence from the vehicle's own way: the flights of real autopilots' software and of the
-# simulated ones, in wind and gusts, had up to 0.44 m after 4 s. The bound is three times that, and grows with t².
-RETURN_M, RETURN_MPS2 = 0.3, 0.12
+# Distance of the first position after a silence from the vehicle's own way, in disagreements of the velocity, and its
+# growth with t². Flights of real autopilots' software and simulated ones, in wind and gusts, had up to 0.44 m after 4 s;
+# the bound is three times that.
+RETURN_S, RETURN_1PS = 1.2, 0.24
 LATE_S = 0.15  # largest difference between the delays of positions and of the vehicle's own velocity
 SMOOTHED_S = 0.3  # the same with smoothing inside a camera system, which makes positions follow late
 SHORTEST = 0.3  # of the window: over less, two velocities are not compared
@@ -150,8 +151,9 @@ def _find_return(
         return None
     (then_ns, then), (at_ns, now) = before[-1], offsets[-1]
     s, off = (at_ns - then_ns) * 1e-9, [b - a for a, b in zip(then, now, strict=True)]
-    # |o - o_0| > e_0 + ½ a t²
-    return (s, off) if math.hypot(*off) > RETURN_M + 0.5 * RETURN_MPS2 * s * s else None
+    # |o - o_0| > (1.2 s + 0.24 1/s t²) v_max
+    bound_m = (RETURN_S + RETURN_1PS * s * s) * observation.parameters.disagreement_mps
+    return (s, off) if math.hypot(*off) > bound_m else None
 
 
 def _find_drift(
