@@ -40,8 +40,8 @@ PLAIN = 1.5  # this many times the bound is beyond it at once
 CORRECTS_NS = 1_000_000_000
 UNRESOLVED_NS = 600_000_000  # longest time without positions after a contradiction
 # Distance of the first position after a silence from the vehicle's own way, in disagreements of the velocity, and its
-# growth with t². Flights of real autopilots' software and simulated ones, in wind and gusts, had up to 0.44 m after 4 s;
-# the bound is three times that.
+# growth with t². Flights of real autopilots' software and of simulated ones had up to 0.44 m after 4 s in wind:
+# a third of the bound.
 RETURN_S, RETURN_1PS = 1.2, 0.24
 LATE_S = 0.15  # largest difference between the delays of positions and of the vehicle's own velocity
 SMOOTHED_S = 0.3  # the same with smoothing inside a camera system, which makes positions follow late
