@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.daemon.landing_guard import Landing
+from uavctl.daemon.landing_guard import LandingFrames
 from uavctl.daemon.landing_host import land
 from uavctl.mavlink.landing import LandingRequest
 
@@ -44,7 +44,7 @@ def ask(ends: Ends, land_s: float) -> LandingRequest:
         peer = None
     except OSError:
         peer = vehicle.getsockname()
-    land(Landing((request.target[2],), (1, 1), "px4", peer), flight.fileno(), request)
+    land(LandingFrames((request.target[2],), (1, 1), "px4", peer), flight.fileno(), request)
     return request
 
 

@@ -26,7 +26,7 @@ REQUESTS = 20  # signed ones; each has its own time stamp
 SIGN_OF_LIFE, END = b".", b"end"
 
 
-class Landing(msgspec.Struct, frozen=True, array_like=True):
+class LandingFrames(msgspec.Struct, frozen=True, array_like=True):
     """What the process needs to land the vehicle; without frames it is not to."""
 
     requests: tuple[tuple[bytes, ...], ...] = ()  # frames of each request in turn; the last ones repeat
@@ -58,19 +58,19 @@ class LandingGuard:
             descriptors = (self._connection.find_sender()[0],) if landing.requests else ()
             socket.send_fds(self._helper.socket, [msgspec.msgpack.encode(landing)], descriptors)
 
-    def _make_landing(self, target: LandingTarget | None) -> Landing:
+    def _make_landing(self, target: LandingTarget | None) -> LandingFrames:
         if target is None or self._connection.closed:
-            return Landing()
+            return LandingFrames()
         vehicle, autopilot, frames = target
         number, peer = self._connection.find_sender()
         if number < 0:
-            return Landing()
+            return LandingFrames()
         requests = tuple(
             tuple(self._connection.encode_ahead(frame, (1 + index) * self._answer_ns) for frame in frames)
             for index in range(REQUESTS)
         )
         is_unsigned = requests[0] == frames
-        return Landing(requests[:1] if is_unsigned else requests, vehicle, autopilot, peer)
+        return LandingFrames(requests[:1] if is_unsigned else requests, vehicle, autopilot, peer)
 
     def close(self) -> None:
         """End the process without a landing request."""

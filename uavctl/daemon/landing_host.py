@@ -18,7 +18,7 @@ from contextlib import suppress
 import msgspec
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.daemon.landing_guard import END, SIGN_OF_LIFE, Landing
+from uavctl.daemon.landing_guard import END, SIGN_OF_LIFE, LandingFrames
 from uavctl.mavlink.landing import LandingRequest
 
 SILENCE_S = 5.0  # beyond the time limit of a tick, and beyond the vehicle's own time limits of setpoints
@@ -31,7 +31,7 @@ class Feed:
 
     def __init__(self, feed: socket.socket) -> None:
         self._feed = feed
-        self.landing, self.descriptor = Landing(), -1
+        self.landing, self.descriptor = LandingFrames(), -1
 
     def wait_for_death(self, flight: int) -> bool:
         """Wait until the flight's process has died; False if it has ended in order."""
@@ -57,12 +57,12 @@ class Feed:
         if data not in (SIGN_OF_LIFE, END, b""):
             if self.descriptor >= 0:
                 os.close(self.descriptor)
-            self.landing = msgspec.msgpack.decode(data, type=Landing)
+            self.landing = msgspec.msgpack.decode(data, type=LandingFrames)
             self.descriptor = descriptors[0] if descriptors else -1
         return data
 
 
-def land(landing: Landing, descriptor: int, request: LandingRequest) -> None:
+def land(landing: LandingFrames, descriptor: int, request: LandingRequest) -> None:
     """Ask for landing until the request is answered or over."""
     request.prepare(landing.vehicle, landing.autopilot)
     request.begin(time.monotonic_ns())

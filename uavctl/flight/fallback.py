@@ -15,7 +15,8 @@ A state machine of four modes, each with a time limit:
 1. Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.monitors.vehicle_velocity`),
    else by the predicted one. By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold
    runs on.
-2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates.
+2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. A prediction
+   that nothing measures is braked on only until it is slow.
 3. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.
 4. The way back to TRACK, from BRAKE and HOLD with reason RECOVER only, is decided at Δt boundaries
    (`uavctl.flight.decide`).
