@@ -216,6 +216,15 @@ def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
         assert advance_fallback(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
 
 
+def test_where_a_source_was_found_wrong_and_no_position_comes_it_lands_once_it_has_braked() -> None:
+    braking = Fallback(mode=BRAKE, since_ns=5 * S)
+    assert advance_fallback(braking, 6 * S, FAST, ZERO, PARAMETERS, contradicted=True) == braking
+    held = advance_fallback(braking, 6 * S, 0.0, ZERO, PARAMETERS, contradicted=True)
+    assert held.mode is HOLD
+    assert advance_fallback(held, 6 * S + 1, 0.0, ZERO, PARAMETERS, contradicted=True).mode is LAND
+    assert advance_fallback(held, 6 * S + 1, 0.0, ZERO, PARAMETERS).mode is HOLD
+
+
 def test_positions_that_are_back_let_the_time_to_hold_begin_again() -> None:
     holding = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
     assert restart_hold(holding, 6 * S) == replace(holding, held_ns=6 * S)

@@ -322,6 +322,8 @@ def _fall_back(begun: Decided, fallback: Fallback, phase: _Phase, reason: str) -
     if fallback.mode is ControlMode.LAND and not fallback.is_final:
         held_s = (phase.context.at_ns - (before.held_ns or phase.context.at_ns)) * 1e-9
         reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
+        if _is_contradicted(phase):
+            reason = "no position comes, and the vehicle's own velocity or inertial data were found wrong: landing"
     consecutive = 0 if begun.fallback is None else begun.consecutive_samples
     hold_point_m = None
     if fallback.mode is ControlMode.HOLD:
@@ -362,7 +364,6 @@ def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     state, context, view = phase.state, phase.context, phase.view
     moving, measured = find_braking_velocity(state, context, phase.supervised)
     is_predicted = not (measured or carries_estimate(fallback, view.belief))
-    is_silent = view.belief is None or context.at_ns - view.belief.captured_ns > LOST_NS
     return advance_fallback(
         fallback,
         context.at_ns,
@@ -371,9 +372,23 @@ def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
         context.controller.fallback,
         find_hold_accel(fallback, begun.biases, context, phase.supervised),
         measured=measured,
-        predicted=is_predicted and is_silent,
+        predicted=is_predicted and _is_silent(phase),
         blind=is_predicted and (view.age_steps is None or view.age_steps >= context.controller.horizon),
+        contradicted=_is_contradicted(phase),
     )
+
+
+def _is_silent(phase: _Phase) -> bool:
+    """Whether no position has come for a while."""
+    belief = phase.view.belief
+    return belief is None or phase.context.at_ns - belief.captured_ns > LOST_NS
+
+
+def _is_contradicted(phase: _Phase) -> bool:
+    """Whether no position comes, and one of the vehicle's own sources was found wrong."""
+    belief, change = phase.view.belief, phase.supervised.monitors.engaged.velocity_change
+    is_doubted = belief is not None and belief.inertial.distrusted_ns is not None
+    return _is_silent(phase) and (change.has_found_wrong or is_doubted)
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:

@@ -54,10 +54,14 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
 
     @property
+    def has_found_wrong(self) -> bool:
+        """Whether the own velocity or inertial data were found wrong."""
+        return self.velocity_wrong_ns is not None or self.inertial_wrong_ns is not None
+
+    @property
     def contradicts(self) -> bool:
         """Whether both changes contradict each other, or one of them was found wrong."""
-        is_found = self.velocity_wrong_ns is not None or self.inertial_wrong_ns is not None
-        return is_found or self.disagrees_ns is not None
+        return self.has_found_wrong or self.disagrees_ns is not None
 
     def supports_velocity(self, at_ns: int) -> bool:
         """Whether inertial data have changed as the own velocity has, just now."""
