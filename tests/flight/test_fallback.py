@@ -30,8 +30,9 @@ PARAMETERS = FallbackParameters(
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, ENVELOPE, STOP, TO_LAND = (
+RECOVER, CONTRADICTED, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, ENVELOPE, STOP, TO_LAND = (
     FallbackReason.RECOVER,
+    FallbackReason.CONTRADICTED,
     FallbackReason.CONTROLLER_FAILED,
     FallbackReason.POSITIONS_DISTRUSTED,
     FallbackReason.ENVELOPE,
@@ -174,7 +175,15 @@ def test_an_end_that_is_asked_for(before: Fallback | None, reason: FallbackReaso
 
 
 def test_there_is_a_way_back_from_one_end_only() -> None:
-    assert [Fallback(HOLD, 0, reason).is_final for reason in FallbackReason] == [False, True, True, True, True, True]
+    assert [Fallback(HOLD, 0, reason).is_final for reason in FallbackReason] == [
+        False,
+        True,
+        True,
+        True,
+        True,
+        True,
+        True,
+    ]
 
 
 def test_what_has_been_handed_over_has_ended() -> None:
@@ -214,15 +223,6 @@ def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
     before = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
     for after_ns, wanted in ((round(held_s * S) - 1, HOLD), (round(held_s * S), LAND)):
         assert advance_fallback(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
-
-
-def test_where_a_source_was_found_wrong_and_no_position_comes_it_lands_once_it_has_braked() -> None:
-    braking = Fallback(mode=BRAKE, since_ns=5 * S)
-    assert advance_fallback(braking, 6 * S, FAST, ZERO, PARAMETERS, contradicted=True) == braking
-    held = advance_fallback(braking, 6 * S, 0.0, ZERO, PARAMETERS, contradicted=True)
-    assert held.mode is HOLD
-    assert advance_fallback(held, 6 * S + 1, 0.0, ZERO, PARAMETERS, contradicted=True).mode is LAND
-    assert advance_fallback(held, 6 * S + 1, 0.0, ZERO, PARAMETERS).mode is HOLD
 
 
 def test_positions_that_are_back_let_the_time_to_hold_begin_again() -> None:

@@ -50,6 +50,7 @@ REENGAGE_NS = CORRECTS_NS + 400_000_000
 PLANNED_NS = 1_000_000_000
 CARRIES_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL = {
+    FallbackReason.CONTRADICTED: "no position came, and the vehicle's own velocity or inertial data were found wrong",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
     FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
     FallbackReason.ENVELOPE: "what is seen cannot be",
@@ -113,6 +114,8 @@ def _begin(phase: _Phase, ordered: Ordered) -> Decided:
     fallback = ordered.fallback
     for reason in supervised.fallback_reasons:
         fallback = request_fallback(fallback, reason, at_ns)
+    if fallback is not None and _is_contradicted(phase):
+        fallback = request_fallback(fallback, FallbackReason.CONTRADICTED, at_ns)
     before, outliers = state.fallback.flown, state.estimator.sources.outliers
     is_final = fallback is not None and fallback.is_final
     becomes_final = is_final and not (before is not None and before.is_final)
@@ -322,8 +325,6 @@ def _fall_back(begun: Decided, fallback: Fallback, phase: _Phase, reason: str) -
     if fallback.mode is ControlMode.LAND and not fallback.is_final:
         held_s = (phase.context.at_ns - (before.held_ns or phase.context.at_ns)) * 1e-9
         reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
-        if _is_contradicted(phase):
-            reason = "no position comes, and the vehicle's own velocity or inertial data were found wrong: landing"
     consecutive = 0 if begun.fallback is None else begun.consecutive_samples
     hold_point_m = None
     if fallback.mode is ControlMode.HOLD:
@@ -374,7 +375,6 @@ def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
         measured=measured,
         predicted=is_predicted and _is_silent(phase),
         blind=is_predicted and (view.age_steps is None or view.age_steps >= context.controller.horizon),
-        contradicted=_is_contradicted(phase),
     )
 
 

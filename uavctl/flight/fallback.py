@@ -5,9 +5,9 @@ A state machine of four modes, each with a time limit:
     BRAKE --slow enough, or brake_s over--> HOLD --by its reason--> LAND --next tick--> STOPPED
 
     reason                 from HOLD
-    RECOVER                LAND after hold_s, or blind_hold_s, if configured; else it holds on. LAND at once where no
-                           position comes and one of the vehicle's own sources was found wrong
-    CONTROLLER_FAILED      LAND once its zero has been sent, if configured; else STOPPED
+    RECOVER                LAND after hold_s, or blind_hold_s, if configured; else it holds on
+    CONTRADICTED           LAND once its zero has been sent, if configured; else STOPPED
+    CONTROLLER_FAILED      the same
     POSITIONS_DISTRUSTED   the same
     ENVELOPE               the same; it does not brake before, as no position is believed: level at once
     STOP                   LAND once its zero has been sent, if configured; else STOPPED
@@ -58,6 +58,8 @@ class FallbackReason(IntEnum):
     """Reason of the fallback, which decides its end. A greater one overrides a smaller one, for good."""
 
     RECOVER = auto()  # too few positions: plans fly again once they are back
+    # No position came, and one of the vehicle's own sources was found wrong: positions that come back could not be checked.
+    CONTRADICTED = auto()
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
     ENVELOPE = auto()  # a monitor found the motion impossible: no plan again, and no braking
@@ -117,7 +119,6 @@ def advance_fallback(
     measured: bool = False,
     predicted: bool = False,
     blind: bool = False,
-    contradicted: bool = False,
 ) -> Fallback:
     """Advance the fallback to `at_ns`, with all transitions that are due.
 
@@ -129,8 +130,6 @@ def advance_fallback(
         measured: Whether the speed is the vehicle's own velocity, not a prediction.
         predicted: Whether it is a prediction that no recent position, and no inertial data, carry on.
         blind: Whether it is a prediction without a recent position: nothing shows a drift.
-        contradicted: Whether no position comes, and the vehicle's own velocity or inertial data were found wrong: then
-            it does not hold, as positions that come back could not be checked.
     """
     mode = fallback.mode
     if mode is ControlMode.STOPPED:
@@ -140,8 +139,6 @@ def advance_fallback(
     elapsed_s = (at_ns - fallback.since_ns) * 1e-9
     held_ns = fallback.since_ns if fallback.held_ns is None else fallback.held_ns
     hold_s = min(parameters.hold_s, parameters.blind_hold_s) if blind else parameters.hold_s
-    if contradicted:
-        hold_s = 0.0
     due = (mode is ControlMode.HOLD or fallback.held_ns is not None) and (at_ns - held_ns) * 1e-9 >= hold_s
     if mode is ControlMode.BRAKE and not due:
         slow = speed_mps < (PREDICTED_STILL_MPS if predicted else STILL_MPS) or elapsed_s >= parameters.brake_s
