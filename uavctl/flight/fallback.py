@@ -58,7 +58,7 @@ class FallbackReason(IntEnum):
     """Reason of the fallback, which decides its end. A greater one overrides a smaller one, for good."""
 
     RECOVER = auto()  # too few positions: plans fly again once they are back
-    # No position came, and one of the vehicle's own sources was found wrong: positions that come back could not be checked.
+    # No position came, and one of the vehicle's own sources was found wrong: positions could not be checked.
     CONTRADICTED = auto()
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
