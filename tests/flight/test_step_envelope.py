@@ -233,5 +233,5 @@ def test_a_source_found_wrong_in_a_silence_ends_the_flight_on_plans(wrong: str) 
     state = replace(state, monitors=replace(state.monitors, engaged=engaged))
     state, _ = run_tick(state, inputs[begun + TICKS], ours)
     assert state.fallback.flown is not None
-    wanted = FallbackReason.RECOVER if wrong == "nothing" else FallbackReason.CONTRADICTED
+    wanted = FallbackReason.RECOVER if wrong == "nothing" else FallbackReason.SOURCE_FAILED
     assert state.fallback.flown.reason is wanted

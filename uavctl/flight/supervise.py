@@ -327,12 +327,23 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
     """Judge whether a plan may fly on without positions: not where what carries the estimate on is wrong, or lost."""
     if (view.age_steps or 0) < PLAYED_OUT_STEPS or view.belief is None:
         return NO_VERDICT
-    change, trust = monitors.velocity_change, view.belief.inertial
-    if change.velocity_wrong_ns is not None or change.inertial_wrong_ns is not None:
+    if monitors.velocity_change.has_found_wrong:
         return _CONTRADICTED
-    is_lost = trust.distrusted_ns is not None or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
-    is_silent = context.at_ns - view.belief.captured_ns > LOST_NS
-    return _CARRIED_BY_NOTHING if is_silent and is_lost else NO_VERDICT
+    is_carried = not are_positions_lost(view.belief, context.at_ns) or not are_inertial_lost(view.belief, context.at_ns)
+    return NO_VERDICT if is_carried else _CARRIED_BY_NOTHING
+
+
+def are_positions_lost(belief: Belief | None, at_ns: int) -> bool:
+    """Whether no position has come for a while."""
+    return belief is None or at_ns - belief.captured_ns > LOST_NS
+
+
+def are_inertial_lost(belief: Belief | None, at_ns: int) -> bool:
+    """Whether inertial data were used, and are distrusted now or have not come for a while."""
+    if belief is None:
+        return False
+    trust = belief.inertial
+    return trust.distrusted_ns is not None or at_ns - (trust.used_ns or at_ns) > LOST_NS
 
 
 def _is_likely(track: OutlierTrack | None) -> bool:
