@@ -308,7 +308,7 @@ def _judge_sample(
             return sources, NO_VERDICT
         return _judge_jump(kalman, sources, offset, _prepare_sample(sources, sample, at_ns), belief)
     if frozen.is_repeat(tracks[sample.source], at_ns):
-        # A value that came before did not jump: the prediction has moved away from a source that is frozen.
+        # A repeated value did not jump: the prediction has moved away from a source that is frozen.
         return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN)
     return replace(sources, outliers=outlier_track), verdict
 
@@ -331,10 +331,10 @@ def _judge_jump(
     for axis, value in zip(kalman.axes, offset.tolist(), strict=False):
         offset_m[axis] = value
     # √(H P H' + R)
-    spread_m = np.sqrt(belief.cov.diagonal()[index] + compute_position_variance(kalman.parameters, counted))
+    offset_std_m = np.sqrt(belief.cov.diagonal()[index] + compute_position_variance(kalman.parameters, counted))
     north, east, down = offset_m
     age_s = (at_ns - belief.captured_ns) * 1e-9
-    track, outcome = jumps.update(sources.jumps, (north, east, down), spread_m, at_ns, age_s)
+    track, outcome = jumps.update(sources.jumps, (north, east, down), offset_std_m, at_ns, age_s)
     sources = replace(sources, jumps=track)
     if outcome is jumps.Outcome.COUNTS:
         return sources, NO_VERDICT
