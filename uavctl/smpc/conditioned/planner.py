@@ -456,9 +456,9 @@ class ConditionedSolver:
 
     def _find_input_bounds(self, preview: Preview) -> tuple[Array, Array, Array | None]:
         """Return the smallest and largest inputs of each stage, and the reduction of the rows of U (m,)."""
-        if preview.inputs is None or not self._box:
+        if preview.input_bounds is None or not self._box:
             return self._low, self._high, None
-        lower, upper = (side.clip(self._low[0], self._high[0]) for side in preview.inputs)
+        lower, upper = (side.clip(self._low[0], self._high[0]) for side in preview.input_bounds)
         c, b = self.problem.input_set.c, self.problem.input_set.b
         column = (c != 0.0).argmax(axis=1)
         coefficients = c[np.arange(len(b)), column]
