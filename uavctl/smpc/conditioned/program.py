@@ -300,7 +300,7 @@ class RegulatedRows:
         self.columns = _make_slices([part.rows_x.size for part in parts])  # columns of each part
         changes = np.diff(inputs, axis=0, prepend=0.0)
         hard: list[Array] = []
-        hold_maps: list[Array] = []
+        rest_maps: list[Array] = []
         input_rows: list[Index] = []
         sides: list[Array] = []
         first: list[Index] = []
@@ -309,13 +309,13 @@ class RegulatedRows:
             slew_rows = slew.find_rows(part.inputs)
             d = slew.d[slew_rows]
             hard.append(np.concatenate([c @ inputs, d @ changes, -d @ changes], axis=1).reshape(-1, n_x))
-            hold_map = np.zeros((steps, len(c) + 2 * slew_rows.size, plant.n_u))
-            hold_map[:, : len(c)] = c
+            rest_map = np.zeros((steps, len(c) + 2 * slew_rows.size, plant.n_u))
+            rest_map[:, : len(c)] = c
             input_row = np.full((steps, len(c) + 2 * slew_rows.size), -1)
             input_row[:, : len(c)] = part.rows_u
             input_rows.append(input_row.ravel())
-            hold_map[0, len(c) :] = np.concatenate([d, -d])
-            hold_maps.append(hold_map.reshape(-1, plant.n_u))
+            rest_map[0, len(c) :] = np.concatenate([d, -d])
+            rest_maps.append(rest_map.reshape(-1, plant.n_u))
             side = np.full((steps, len(c) + 2 * slew_rows.size), slew.side)
             side[:, : len(c)] = problem.input_set.b[part.rows_u]
             side[0, len(c) :] = 0.0  # set by the input sent last
@@ -323,7 +323,7 @@ class RegulatedRows:
             sides.append(side.ravel())
             first.append(np.stack([slew_rows, before + len(c) + np.arange(slew_rows.size)]))
         self.hard = _make_slices([entries.size for entries in sides])  # hard rows of each part
-        self._hard_sides, self._hold_map = np.concatenate(sides), np.vstack(hold_maps)
+        self._hard_sides, self._rest_map = np.concatenate(sides), np.vstack(rest_maps)
         rows_u = np.concatenate(input_rows)
         # Indices of the input set's rows among the hard rows, and the row of the set of each
         self._input_rows = np.flatnonzero(rows_u >= 0)
@@ -340,7 +340,7 @@ class RegulatedRows:
         self,
         dx: Array,
         sides: Array,
-        hold: Array | None,
+        equilibrium_input: Array | None,
         first: tuple[Array, Array] | None,
         input_reduction: Array | None = None,
     ) -> tuple[Array, Array]:
@@ -349,9 +349,9 @@ class RegulatedRows:
         Args:
             dx: Deviation of the state (n_x,).
             sides: Right sides of the state rows minus their values at the reference, (H, m) or (m,).
-            hold: Input at the reference (n_u,); None for zero.
+            equilibrium_input: Input at the reference (n_u,); None for zero.
             first: See `SlewRows.measure_first_step`; None if the input sent last is unknown.
-            tightening: Reduction of the right sides of the input set (m,); None: none.
+            input_reduction: Reduction of the right sides of the input set (m,); None: none.
         """
         # b - C x_t(dx), b - C u_t(dx), side ∓ D (u_t - u_(t-1))
         margin: Array = self._margin.dot(dx)
@@ -363,8 +363,8 @@ class RegulatedRows:
         hard += self._hard_sides
         if input_reduction is not None:
             hard[self._input_rows] -= input_reduction[self._row_u]
-        if hold is not None:
-            hard -= self._hold_map @ hold
+        if equilibrium_input is not None:
+            hard -= self._rest_map @ equilibrium_input
         if first is None:
             hard[self._first] = OPEN
         else:
