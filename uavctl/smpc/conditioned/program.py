@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
-from uavctl.smpc.first_rows import FirstRows
 from uavctl.smpc.nominal import ControlProblem, Lqr, Part, predict_regulated
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, QuadraticProgram, Sense
 from uavctl.smpc.sets import Equilibria, Polytope, find_pairs
+from uavctl.smpc.working_set import WorkingSetGuess
 
 Index = NDArray[np.intp]
 
@@ -155,8 +155,10 @@ class PartProgram:
             max_iterations=MAX_ITERATIONS,
             linear=False,
         )
-        is_suitable = FirstRows.is_suitable(*by_stage, len(d))
-        self._guess_rows = FirstRows(*by_stage, self._program.sense).guess if is_suitable else self._guess_ramps
+        is_suitable = WorkingSetGuess.is_suitable(*by_stage, len(d))
+        self._guess_working_set = (
+            WorkingSetGuess(*by_stage, self._program.sense).guess if is_suitable else self._guess_ramps
+        )
 
     def follow_path(self, path_x: Array, path_u: Array) -> Array:
         """Return the z (n,) of least cost along a path of the whole plant (H, n_x), (H, n_u), without limits."""
@@ -187,30 +189,30 @@ class PartProgram:
             reuse_rows: Start from the active rows of the last program, which must be of the same question.
         """
         upper, lower = margins.take(self._upper), -margins.take(self._lower)
-        first_rows = None if reuse_rows else self._guess_rows(upper, lower)
+        working_set = None if reuse_rows else self._guess_working_set(upper, lower)
         # Where two back-offs overlap, the mean stays in the middle.
         crossed = upper < lower
         if np.count_nonzero(crossed):
             middle = 0.5 * (upper + lower)
             np.copyto(upper, middle, where=crossed)
             np.copyto(lower, middle, where=crossed)
-        return self._program.solve_sides(upper, lower, first_rows, reuse_rows)
+        return self._program.solve_sides(upper, lower, working_set, reuse_rows)
 
     def _guess_ramps(self, upper: Array, lower: Array) -> Sense | None:
         """Guess the active rows: the setpoint moves from the last one to the regulator's at the slew limit.
 
         It arrives in the stage where the sum of the margins of all slew rows so far is not negative.
         """
-        first_rows = None
+        working_set = None
         for i in self._slews:
             for sides, sign, state in ((upper, 1.0, ACTIVE), (lower, -1.0, BELOW)):
                 if sign * sides[i] < 0.0:
                     missing = (sign * sides[i :: self._width]).cumsum() < 0.0
-                    if first_rows is None:
-                        first_rows = self._program.sense.copy()
+                    if working_set is None:
+                        working_set = self._program.sense.copy()
                     count = int(missing.argmin()) or self._steps
-                    first_rows[i : i + count * self._width : self._width] += state
-        return first_rows
+                    working_set[i : i + count * self._width : self._width] += state
+        return working_set
 
     def add_to_plan(self, z: Array, inputs: Array, states: Array) -> None:
         """Add the effect of z to the inputs (H, n_u) and states (H+1, n_x) of the whole plant."""
