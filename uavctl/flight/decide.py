@@ -1,11 +1,11 @@
 """Phase 4 of a tick: make a new plan, continue the old one, or fall back.
 
-1. The ends that monitors ask for change the fallback, after the operator's orders did.
-2. A vehicle that is handed over, silent, or takes no setpoints: no plan.
-3. A final fallback, or a verdict to brake: the fallback flies on, or begins.
-4. Else, at a Δt boundary: an age of H is the fallback. A new measurement is a new plan, and so are new inertial data
-   where the solver counts the age. Else the old plan plays out.
-5. Between boundaries, what the last one decided is held.
+1. The operator's orders change the fallback, then verdicts that end the plans, then the operator's stop.
+2. A vehicle that is handed over, is not heard, or takes no setpoints gets no plan.
+3. A final fallback flies on. A verdict to brake begins the fallback.
+4. Otherwise each Δt boundary decides. At an age of H the fallback flies. A new position gives a new plan, and so do new
+   inertial data where the solver counts the age. Without either, the old plan is flown on.
+5. Between boundaries the last decision is held.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def _update_biases(phase: _Phase) -> Biases:
 
 
 def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
-    """Decide for a vehicle that is handed over, stopped, silent, or takes no setpoints; None for any other."""
+    """Decide for a vehicle that is handed over, stopped, not heard, or takes no setpoints; None for any other."""
     inputs, why_not = phase.context.inputs, phase.context.not_ready_reason
     at_ns, fallback = phase.context.at_ns, draft.fallback
     if fallback is not None and fallback.is_over:
@@ -246,7 +246,7 @@ def _plan_from(draft: Decided, belief: Belief, phase: _Phase) -> Decided:
 
 
 def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, phase: _Phase) -> Decided:
-    """Ask for a plan if there is a new measurement, as ordered; else, or if that fails, the old one plays out."""
+    """Ask for a plan if there is new data, as ordered; without it, or without an answer, the old plan is flown on."""
     controller, context = phase.controller, phase.context
     before_ns = None if draft.plan is None else draft.superseded_after_ns
     new_measurement = before_ns is None or base.captured_ns > before_ns
@@ -336,7 +336,7 @@ def _fall_back(draft: Decided, fallback: Fallback, phase: _Phase, reason: str) -
 
 
 def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Decided:
-    """Let the fallback's time run on while the vehicle is silent.
+    """Let the fallback's time run on while the vehicle is not heard.
 
     Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime. Where it is due
     nothing is sent, so that a vehicle that still listens lands by its own failsafe.

@@ -15,8 +15,8 @@ A state machine of four modes, each with a time limit:
 1. Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.monitors.vehicle_velocity`),
    else by the predicted one. By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold
    runs on.
-2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. A prediction
-   that nothing measures is braked on only until it is slow.
+2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. By a
+   prediction from inputs alone the vehicle brakes only until that is slow.
 3. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.
 4. The way back to TRACK, from BRAKE and HOLD with reason RECOVER only, is decided at Δt boundaries
    (`uavctl.flight.decide`).
@@ -60,7 +60,7 @@ class FallbackReason(IntEnum):
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
     ENVELOPE = auto()  # a monitor found the motion impossible: no plan again, and no braking
-    STOP = auto()  # the operator's stop
+    STOP = auto()  # the operator's stop (Ctrl-C), or the end of the time to fly
     LAND = auto()  # an order to land, or the mission is over: it lands whatever `fallback.land` says
 
 
@@ -101,7 +101,7 @@ def request_fallback(fallback: Fallback | None, reason: FallbackReason, at_ns: i
 
 
 def restart_hold(fallback: Fallback, at_ns: int) -> Fallback:
-    """Let the time to hold begin again: positions are back, and are compared before plans fly again."""
+    """Restart the time to hold: positions are back, and are compared before plans fly again."""
     return fallback if fallback.held_ns is None else replace(fallback, held_ns=at_ns)
 
 

@@ -8,7 +8,7 @@
 4. Terminal condition: x̄_N = x_s, and ‖Y(θ)‖₂ <= 1, a semidefinite cone.
 5. `RestingPoint` is a point near the answer, to which numbers are relative: the plan that rests at the place in the
    limits nearest to the drift of the state, with the slack that this takes. From far outside the limits, the answer
-   differs from it by numbers of usual size, which the solver finds with its usual accuracy.
+   differs from it by numbers for which the solver is accurate.
 """
 
 from __future__ import annotations
