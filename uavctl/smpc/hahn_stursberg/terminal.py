@@ -222,7 +222,8 @@ def _check_fit(
     share = np.divide(half_width, margin, out=np.full_like(half_width, np.inf), where=margin > 0)
     row = int(np.argmax(share))
     name = _name_row(polytope.c[row], row, quantity)
-    text = f"half-width of the terminal set at {name}, against the margin from the target"
+    # The design's hash includes this text: another word would give recorded designs another hash.
+    text = f"half-width of the terminal set at {name}, against the room from the target"
     return AssumptionCheck(item, bool(half_width[row] <= margin[row]), float(half_width[row]), float(margin[row]), text)
 
 
