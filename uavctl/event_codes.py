@@ -43,7 +43,7 @@ class EventCode(StrEnum):
     SAMPLE_INVALID = "sample-invalid"
     SAMPLE_FUTURE = "sample-future"  # captured after it arrived, by its stamp
     SAMPLE_FROZEN = "sample-frozen"  # a source repeats its value although the vehicle moves
-    SAMPLE_REPEATED = "sample-repeated"  # a source repeats its value, and it may be stuck
+    SAMPLE_REPEATED = "sample-repeated"  # a source repeats its value, and it may be frozen
     SAMPLE_JUMP = "sample-jump"  # a position that the vehicle cannot have come to
     # Solver
     SOLVE_INFEASIBLE = "solve-infeasible"

@@ -213,16 +213,16 @@ def test_holding_begins_once_the_setpoint_is_what_is_held(
 
 
 @pytest.mark.parametrize(
-    ("blind", "hold_s", "blind_hold_s", "held_s"),
+    ("is_blind", "hold_s", "blind_hold_s", "held_s"),
     [(False, 3.0, 0.5, 3.0), (True, 3.0, 0.5, 0.5), (True, 0.25, 0.5, 0.25), (False, 0.25, 0.5, 0.25)],
 )
 def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
-    blind: bool, hold_s: float, blind_hold_s: float, held_s: float
+    is_blind: bool, hold_s: float, blind_hold_s: float, held_s: float
 ) -> None:
     parameters = replace(PARAMETERS, hold_s=hold_s, blind_hold_s=blind_hold_s)
     before = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
     for after_ns, wanted in ((round(held_s * S) - 1, HOLD), (round(held_s * S), LAND)):
-        assert advance_fallback(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
+        assert advance_fallback(before, 5 * S + after_ns, 0.0, ZERO, parameters, is_blind=is_blind).mode is wanted
 
 
 def test_positions_that_are_back_let_the_time_to_hold_begin_again() -> None:
@@ -241,12 +241,12 @@ def test_nobody_is_blind_unless_it_is_said() -> None:
 
 def test_a_time_to_hold_that_ends_while_it_brakes_again_begins_no_braking_anew() -> None:
     before = Fallback(mode=BRAKE, since_ns=5 * S, held_ns=S)
-    after = advance_fallback(before, 6 * S, 9.0, (1.0, 0.0, 0.0), replace(PARAMETERS, land=False), measured=True)
+    after = advance_fallback(before, 6 * S, 9.0, (1.0, 0.0, 0.0), replace(PARAMETERS, land=False), is_measured=True)
     assert after == before
 
 
 @pytest.mark.parametrize(
-    ("reason", "measured", "speed_mps", "wanted"),
+    ("reason", "is_measured", "speed_mps", "wanted"),
     [
         (RECOVER, True, 0.151, BRAKE),
         (RECOVER, True, 0.15, HOLD),
@@ -256,11 +256,16 @@ def test_a_time_to_hold_that_ends_while_it_brakes_again_begins_no_braking_anew()
     ],
 )
 def test_what_drifts_by_its_own_word_is_braked_again(
-    reason: FallbackReason, measured: bool, speed_mps: float, wanted: ControlMode
+    reason: FallbackReason, is_measured: bool, speed_mps: float, wanted: ControlMode
 ) -> None:
     before = Fallback(mode=HOLD, since_ns=5 * S, reason=reason, held_ns=4 * S)
     after = advance_fallback(
-        before, 6 * S, speed_mps, (1.0, 0.0, 0.0), replace(PARAMETERS, hold_s=9.0, blind_hold_s=9.0), measured=measured
+        before,
+        6 * S,
+        speed_mps,
+        (1.0, 0.0, 0.0),
+        replace(PARAMETERS, hold_s=9.0, blind_hold_s=9.0),
+        is_measured=is_measured,
     )
     if reason is STOP:
         assert after.mode is LAND  # its second for the zero is over
@@ -275,7 +280,7 @@ def test_the_time_to_hold_runs_on_while_it_brakes_again(mode: ControlMode, after
     after = advance_fallback(before, 5 * S + after_ns, FAST, ZERO, PARAMETERS)
     assert after == (replace(before, mode=LAND) if over else before)
     # Where nothing is configured to land, it brakes for as long as it drifts.
-    assert advance_fallback(before, 5 * S + after_ns, FAST, ZERO, STAY, measured=True).mode is BRAKE
+    assert advance_fallback(before, 5 * S + after_ns, FAST, ZERO, STAY, is_measured=True).mode is BRAKE
 
 
 def test_a_bias_counts_as_far_as_it_has_been_there_all_the_time_of_late() -> None:

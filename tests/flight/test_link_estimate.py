@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import beta, binom, chi2_contingency, norm
 
 from uavctl.flight.link_estimate import (
-    LinkBelief,
+    LinkCounts,
     LinkEstimateParameters,
     compute_burst_statistic,
     count_step,
@@ -28,11 +28,11 @@ DEFAULT = LinkEstimateParameters(promised=0.7)
 HISTORY = st.lists(st.booleans(), max_size=60)
 
 
-def after(arrived: Iterable[bool], parameters: LinkEstimateParameters) -> LinkBelief:
-    belief = LinkBelief()
+def after(arrived: Iterable[bool], parameters: LinkEstimateParameters) -> LinkCounts:
+    counts = LinkCounts()
     for one in arrived:
-        belief = count_step(belief, bool(one), parameters)
-    return belief
+        counts = count_step(counts, bool(one), parameters)
+    return counts
 
 
 def bursts(rng: np.random.Generator, steps: int, share: float, leave: float) -> NDArray[np.bool_]:
@@ -46,7 +46,7 @@ def bursts(rng: np.random.Generator, steps: int, share: float, leave: float) -> 
 
 
 def test_before_the_first_observation_all_is_open() -> None:
-    estimate = estimate_link(LinkBelief(), DEFAULT, 7)
+    estimate = estimate_link(LinkCounts(), DEFAULT, 7)
     assert estimate == LinkEstimate(
         at_ns=7,
         arrived=0.0,
@@ -78,26 +78,26 @@ def test_the_posterior_is_that_of_the_counts() -> None:
 
 def test_an_observation_counts_half_after_its_half_life() -> None:
     parameters = replace(DEFAULT, half_life_steps=10.0)
-    belief = after([True] + [False] * 10, parameters)
-    assert belief.arrived == pytest.approx(0.5)
+    counts = after([True] + [False] * 10, parameters)
+    assert counts.arrived == pytest.approx(0.5)
     weights = 0.5 ** (np.arange(10) / 10.0)
-    assert belief.lost == pytest.approx(weights.sum())
-    assert belief.pairs == pytest.approx((0.0, weights[9], 0.0, weights[:9].sum()))
-    assert belief.squares == pytest.approx((weights**2).sum())
+    assert counts.lost == pytest.approx(weights.sum())
+    assert counts.pairs == pytest.approx((0.0, weights[9], 0.0, weights[:9].sum()))
+    assert counts.squares == pytest.approx((weights**2).sum())
 
 
 @given(HISTORY)
 def test_transitions_without_forgetting_are_counted(history: list[bool]) -> None:
-    belief = after(history, FOREVER)
+    counts = after(history, FOREVER)
     lost = [not one for one in history]
     counted = [sum((a, b) == pair for a, b in pairwise(lost)) for pair in ((0, 0), (0, 1), (1, 0), (1, 1))]
-    assert belief.pairs == pytest.approx(counted, abs=1e-9)
+    assert counts.pairs == pytest.approx(counted, abs=1e-9)
     table = np.array(counted).reshape(2, 2)
     if table.sum(axis=0).min(initial=1) and table.sum(axis=1).min(initial=1):
         g2 = chi2_contingency(table, correction=False, lambda_="log-likelihood").statistic
-        assert abs(compute_burst_statistic(belief)) == pytest.approx(math.sqrt(max(0.0, g2)), abs=1e-5)
+        assert abs(compute_burst_statistic(counts)) == pytest.approx(math.sqrt(max(0.0, g2)), abs=1e-5)
     else:
-        assert compute_burst_statistic(belief) == pytest.approx(0.0, abs=1e-5)
+        assert compute_burst_statistic(counts) == pytest.approx(0.0, abs=1e-5)
 
 
 @given(HISTORY, st.integers(0, 59), st.floats(0.5, 0.99))
@@ -145,11 +145,11 @@ def test_bursts_are_found_within_a_hundred_steps() -> None:
 def test_a_link_that_begins_to_come_in_bursts_is_found_out() -> None:
     rng, runs, waits = np.random.default_rng(43), 60, []
     for _ in range(runs):
-        belief = after(rng.random(300) < 0.7, DEFAULT)
+        counts = after(rng.random(300) < 0.7, DEFAULT)
         found = []
         for arrived in bursts(rng, 400, 0.3, 0.25):
-            belief = count_step(belief, bool(arrived), DEFAULT)
-            found.append(estimate_link(belief, DEFAULT, 0).bursts)
+            counts = count_step(counts, bool(arrived), DEFAULT)
+            found.append(estimate_link(counts, DEFAULT, 0).bursts)
         waits.append(found.index(True))
     assert np.median(waits) < 120
 
@@ -166,11 +166,11 @@ def test_the_bound_holds_on_bursts_too_once_they_are_found(share: float) -> None
 
 def test_a_link_below_its_promise_is_told_and_one_that_recovers_is_believed_again() -> None:
     rng = np.random.default_rng(45)
-    belief = after(rng.random(200) < 0.4, DEFAULT)
-    assert estimate_link(belief, DEFAULT, 0).below_promise
+    counts = after(rng.random(200) < 0.4, DEFAULT)
+    assert estimate_link(counts, DEFAULT, 0).below_promise
     for arrived in rng.random(400) < 0.9:
-        belief = count_step(belief, bool(arrived), DEFAULT)
-    estimate = estimate_link(belief, DEFAULT, 0)
+        counts = count_step(counts, bool(arrived), DEFAULT)
+    estimate = estimate_link(counts, DEFAULT, 0)
     assert not estimate.below_promise
     assert abs(estimate.arrival_mean - 0.9) < 0.08
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flight_rig import make_room, small_plant
+from flight_rig import make_rest_region, small_plant
 from numpy.typing import NDArray
 
 from uavctl.build.controller import build_controller, build_design
@@ -20,7 +20,7 @@ from uavctl.flight.mission import (
     Fence,
     Mission,
     MissionState,
-    Room,
+    RestRegion,
     Trajectory,
     Waypoint,
     advance_mission,
@@ -50,7 +50,7 @@ def on_a_line(*places_m: float, hold_s: float = 1.0, fences: tuple[Fence, ...] =
         limits=np.array([5.0, 5.0]),
         horizon=4,
         dt_ns=DT_NS,
-        room=Room((0,), np.array([-4.0]), np.array([4.0]), np.array([[1.0, 0.0]]), np.array([[1.0, 0.5]])),
+        rest_region=RestRegion((0,), np.array([-4.0]), np.array([4.0]), np.array([[1.0, 0.0]]), np.array([[1.0, 0.5]])),
         fences=fences,
     )
 
@@ -107,29 +107,36 @@ def test_the_target_is_the_waypoint_and_what_is_wanted() -> None:
 def test_the_longer_horizontal_way_follows_unless_the_vehicle_may_not_rest_there(
     begins: Vec3, ends: Vec3, first: Vec3 | None
 ) -> None:
-    room = make_room(small_plant(("north", "east", "down")))
-    found = room.first(room.at(begins), room.at(ends))
+    region = make_rest_region(small_plant(("north", "east", "down")))
+    found = region.find_leading_target(region.find_equilibrium(begins), region.find_equilibrium(ends))
     if first is None:
         assert found is None
     else:
-        assert found == pytest.approx(room.at(first), abs=1e-9)
+        assert found == pytest.approx(region.find_equilibrium(first), abs=1e-9)
 
 
 def test_no_axis_leads_where_there_is_one_or_where_one_goes_up() -> None:
     for axes in (("north",), ("north", "down")):
-        room = make_room(small_plant(axes))
-        assert room.first(room.at((0.0, 0.0, 0.0)), room.at((3.0, 3.0, 3.0))) is None
+        region = make_rest_region(small_plant(axes))
+        assert (
+            region.find_leading_target(
+                region.find_equilibrium((0.0, 0.0, 0.0)), region.find_equilibrium((3.0, 3.0, 3.0))
+            )
+            is None
+        )
 
 
 def test_one_axis_leads_for_a_time_where_the_first_motion_begins_and_never_again() -> None:
-    room = make_room(small_plant(("north", "east")))
-    begin, end, back = (room.at(place) for place in ((0.0, 0.0, 0.0), (3.0, 2.0, 0.0), (-3.0, -2.0, 0.0)))
-    mission = replace(on_a_line(0.0), room=room, lead_ns=2 * DT_NS)
+    region = make_rest_region(small_plant(("north", "east")))
+    begin, end, back = (
+        region.find_equilibrium(place) for place in ((0.0, 0.0, 0.0), (3.0, 2.0, 0.0), (-3.0, -2.0, 0.0))
+    )
+    mission = replace(on_a_line(0.0), rest_region=region, lead_ns=2 * DT_NS)
     at_rest = lead_with_one_axis(mission, stay_at(MissionState(start_ns=0), begin, 0), begin, 0)
-    assert at_rest.led is None  # there is no way to go
+    assert at_rest.lead is None  # there is no way to go
     led = lead_with_one_axis(mission, stay_at(at_rest, end, 3 * DT_NS), begin, 3 * DT_NS)
     targets = [make_question(mission, led, number * DT_NS)[0].tolist() for number in (3, 4, 5)]
-    assert targets == [list(room.at((0.0, 2.0, 0.0)))] * 2 + [list(end)]
+    assert targets == [list(region.find_equilibrium((0.0, 2.0, 0.0)))] * 2 + [list(end)]
     assert find_target(mission, led, 3 * DT_NS) == end
     ordered = stay_at(led, back, 4 * DT_NS)
     assert lead_with_one_axis(mission, ordered, begin, 4 * DT_NS) == ordered

@@ -305,11 +305,11 @@ def test_a_position_is_far_off_only_if_it_is_so_of_inertial_data_too(off_m: floa
 
 
 @pytest.mark.parametrize(
-    ("clipped", "is_quiet"), [((), True), ((True, False), True), ((False, True), False), ((True,), False)]
+    ("clipped", "is_clean"), [((), True), ((True, False), True), ((False, True), False), ((True,), False)]
 )
-def test_a_position_is_quiet_unless_it_is_itself_far_off(clipped: tuple[bool, ...], is_quiet: bool) -> None:
+def test_a_position_is_clean_unless_it_is_itself_far_off(clipped: tuple[bool, ...], is_clean: bool) -> None:
     state = AccelerationState(clipped=clipped)
-    assert state.is_quiet == is_quiet and not state.is_hinted
+    assert state.is_clean == is_clean and not state.is_hinted
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from flight_rig import (
     make_controller,
     make_inputs,
     make_motion_samples,
-    make_room,
+    make_rest_region,
     make_step_samples,
     run,
     small_plant,
@@ -91,14 +91,14 @@ def test_the_edge_of_the_box_itself_is_flown_to(edge_m: float) -> None:
 def test_hold_stays_where_the_vehicle_comes_to_rest_inside_the_box() -> None:
     for speed_mps, room_m in ((1.0, 5.0), (1.0, 0.7)):
         controller = make_controller()
-        inside = replace(make_room(controller.plant), lower=np.array([-room_m]), upper=np.array([room_m]))
-        controller = replace(controller, mission=replace(controller.mission, room=inside))
+        inside = replace(make_rest_region(controller.plant), lower=np.array([-room_m]), upper=np.array([room_m]))
+        controller = replace(controller, mission=replace(controller.mission, rest_region=inside))
         outputs = run(
             controller, make_inputs(range(5 * TICKS), make_motion_samples(5, speed_mps), commands={9: (STAY,)})
         )
         estimate = outputs[3 * TICKS].estimate
         assert estimate is not None
-        # The rig's room says: half a second of the speed further.
+        # The rig's region says: half a second of the speed further.
         assert places(outputs)[3] == pytest.approx(min(estimate.mean[0] + 0.5 * estimate.mean[1], room_m))
         assert places(outputs)[3] == places(outputs)[4]
         assert places(outputs)[:3] == [0.0] * 3
@@ -232,7 +232,7 @@ def test_an_order_puts_the_landing_at_the_end_off() -> None:
 
 def test_a_plant_that_cannot_rest_everywhere_is_not_sent_anywhere() -> None:
     controller = make_controller()
-    controller = replace(controller, mission=replace(controller.mission, room=None))
+    controller = replace(controller, mission=replace(controller.mission, rest_region=None))
     commands = {3: (goto(1.0, 0, 0), STAY)}
     outputs = run(controller, make_inputs(range(2 * TICKS), make_step_samples(), commands=commands))
     assert answers(outputs[3]) == [EventCode.ORDER_REFUSED, EventCode.ORDER_REFUSED]
@@ -248,29 +248,29 @@ def test_orders_and_their_answers_are_replayed_bit_for_bit() -> None:
 def test_a_configured_flight_knows_where_it_may_rest(preset: str) -> None:
     config = load_config(preset, ["solver.method=exact"])
     controller = build_controller(config)
-    room, plant = controller.mission.room, controller.plant
-    assert room is not None
-    middle = (room.lower + room.upper) / 2
+    region, plant = controller.mission.rest_region, controller.plant
+    assert region is not None
+    middle = (region.lower + region.upper) / 2
     for axis, (index, name) in enumerate(zip(plant.position_index, plant.axes, strict=True)):
         low, high = config.sets.state_lower[index], config.sets.state_upper[index]
-        assert low < room.lower[axis] < room.upper[axis] < high
-        for side, sign in ((room.lower[axis], -1.0), (room.upper[axis], 1.0)):
+        assert low < region.lower[axis] < region.upper[axis] < high
+        for side, sign in ((region.lower[axis], -1.0), (region.upper[axis], 1.0)):
             place = middle.copy()
             place[axis] = side
             ned = [0.0, 0.0, 0.0]
-            for value, ned_axis in zip(place, room.axes, strict=True):
+            for value, ned_axis in zip(place, region.axes, strict=True):
                 ned[ned_axis] = float(value)
-            assert room.refusal((ned[0], ned[1], ned[2])) == ""
-            assert np.array(room.at((ned[0], ned[1], ned[2]))) == pytest.approx(
+            assert region.describe_refusal((ned[0], ned[1], ned[2])) == ""
+            assert np.array(region.find_equilibrium((ned[0], ned[1], ned[2]))) == pytest.approx(
                 plant.equilibrium((ned[0], ned[1], ned[2]))
             )
-            ned[room.axes[axis]] += sign * 0.01
-            assert room.refusal((ned[0], ned[1], ned[2])).startswith(name)
+            ned[region.axes[axis]] += sign * 0.01
+            assert region.describe_refusal((ned[0], ned[1], ned[2])).startswith(name)
     # From a speed it comes to rest ahead of where it is, and at rest it is where it is.
-    x = np.array(room.at((0.0, 0.0, -1.0)))
-    assert room.stopped(tuple(x.tolist())) == pytest.approx(tuple(x.tolist()), abs=1e-9)
+    x = np.array(region.find_equilibrium((0.0, 0.0, -1.0)))
+    assert region.find_stop(tuple(x.tolist())) == pytest.approx(tuple(x.tolist()), abs=1e-9)
     x[plant.velocity_index[0]] = 1.0
-    ahead = room.stopped(tuple(x.tolist()))[plant.position_index[0]] - x[plant.position_index[0]]
+    ahead = region.find_stop(tuple(x.tolist()))[plant.position_index[0]] - x[plant.position_index[0]]
     assert config.smpc.tau is not None
     assert 0.3 < ahead < (config.smpc.horizon - config.smpc.tau) * config.plant.dt_s
 

@@ -112,7 +112,7 @@ def test_row_13_a_jump_with_losses_between_is_not_let_in_by_the_set_that_grows()
     thinned = [one for n, one in enumerate(samples) if n < 6 or n % 2 == 0]
     controller = gated()
     outputs = run(controller, make_inputs(range(14 * TICKS), thinned))
-    assert controller.reach.far[5 * TICKS, 0] > 0.6  # by step 10 inputs alone could have carried it that far
+    assert controller.reach.max_change[5 * TICKS, 0] > 0.6  # by step 10 inputs alone could have carried it that far
     lands = list_modes(outputs).index(LAND)
     assert all(one.decision.accepted == 0 for one in outputs[6 * TICKS : lands])
     assert list_modes(outputs)[10 * TICKS] in (BRAKE, HOLD)

@@ -39,8 +39,8 @@ def reach() -> Reach:
 def test_how_far_inputs_carry_is_the_integral_of_the_step_response() -> None:
     plant = small_plant(("north", "down"))
     reach = make_reach(plant, LIMITS, PARAMETERS, TICK_NS, ticks_per_horizon=HORIZON * TICKS)
-    assert reach.far.shape == (2 * HORIZON * TICKS + 1, 4)
-    assert reach.far[0].tolist() == [0.0] * 4
+    assert reach.max_change.shape == (2 * HORIZON * TICKS + 1, 4)
+    assert reach.max_change[0].tolist() == [0.0] * 4
 
     def velocity_mps(t: float) -> float:  # of v' = a - 0.3 v, 0.25 a' = 1 - a
         fast = quad(lambda s: math.exp(-0.3 * (t - s)) * (1 - math.exp(-s / 0.25)), 0.0, t)[0]
@@ -50,13 +50,13 @@ def test_how_far_inputs_carry_is_the_integral_of_the_step_response() -> None:
         t = ticks * TICK_NS * 1e-9
         position_m = quad(velocity_mps, 0.0, t)[0]
         for column, limit in ((0, 2.0), (1, 1.5)):
-            assert reach.far[ticks, column] == pytest.approx(2.0 * limit * position_m, rel=1e-6)
-            assert reach.far[ticks, column + 2] == pytest.approx(2.0 * limit * velocity_mps(t), rel=1e-6)
+            assert reach.max_change[ticks, column] == pytest.approx(2.0 * limit * position_m, rel=1e-6)
+            assert reach.max_change[ticks, column + 2] == pytest.approx(2.0 * limit * velocity_mps(t), rel=1e-6)
 
 
 def test_the_half_width_counts_begun_ticks_and_is_open_after_two_horizons(reach: Reach) -> None:
     belief = Belief(at_ns=0, captured_ns=0, mean=np.zeros(4), cov=np.diag([0.0004, 0.0009, 1.0, 1.0]))
-    variances, doubt_mps, far = np.array([0.0021, 0.0016]), np.array([0.7]), reach.far
+    variances, doubt_mps, far = np.array([0.0021, 0.0016]), np.array([0.7]), reach.max_change
     for age_ns, ticks in ((0, 0), (1, 1), (TICK_NS, 1), (TICK_NS + 1, 2)):
         aged = structs.replace(belief, captured_ns=-age_ns)
         width = compute_gate(reach, KALMAN, aged, variances, doubt_mps)
@@ -75,7 +75,7 @@ def test_the_velocity_is_doubted_by_what_was_off_as_far_as_inputs_can_have_made_
     belief = Belief(at_ns=0, captured_ns=0, mean=np.zeros(4), cov=np.eye(4))
     step = structs.replace(belief, captured_ns=-DT_NS)
     assert bound_velocity_error(reach, step, off(-0.01)) == pytest.approx([0.1])
-    assert bound_velocity_error(reach, step, off(9.0)) == pytest.approx([reach.far[TICKS, 1]])
+    assert bound_velocity_error(reach, step, off(9.0)) == pytest.approx([reach.max_change[TICKS, 1]])
     assert bound_velocity_error(reach, structs.replace(belief, captured_ns=-4 * 10**9), off(9.0)) == pytest.approx(
         [4.5]
     )

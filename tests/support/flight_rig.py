@@ -17,7 +17,7 @@ from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
-from uavctl.flight.mission import Room, make_hold_mission
+from uavctl.flight.mission import RestRegion, make_hold_mission
 from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.flight.state import ControlState
 from uavctl.flight.tick import TickOutput, make_initial_state
@@ -137,7 +137,12 @@ def make_controller(
         horizon=horizon,
         solver=solver or StubSolver(plant, horizon),
         mission=make_hold_mission(
-            np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=make_room(plant)
+            np.zeros(plant.n_x),
+            plant.position_index,
+            np.zeros(0),
+            horizon=horizon,
+            dt_ns=DT_NS,
+            rest_region=make_rest_region(plant),
         ),
         names=name_constraints((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
         estimator=estimator_parameters(**changes),
@@ -150,7 +155,7 @@ def make_controller(
     )
 
 
-def make_room(plant: Plant, half_m: float = 5.0) -> Room:
+def make_rest_region(plant: Plant, half_m: float = 5.0) -> RestRegion:
     """Places up to `half_m` from the middle; from a speed v it comes to rest v / 2 further."""
     n = len(plant.axes)
     rest, stop = np.zeros((n, plant.n_x)), np.zeros((n, plant.n_x))
@@ -158,7 +163,9 @@ def make_room(plant: Plant, half_m: float = 5.0) -> Room:
         rest[axis, position] = stop[axis, position] = 1.0
         stop[axis, velocity] = 0.5
     axes = tuple(("north", "east", "down").index(axis) for axis in plant.axes)
-    return Room(axes=axes, lower=np.full(n, -half_m), upper=np.full(n, half_m), rest=rest, stop=stop)
+    return RestRegion(
+        axes=axes, lower=np.full(n, -half_m), upper=np.full(n, half_m), equilibrium_map=rest, stop_map=stop
+    )
 
 
 def sample(

@@ -34,8 +34,8 @@ from uavctl.smpc.conditioned.planner import (
     AnyDesign,
     ConditionedDesign,
     ConditionedSolver,
-    conditioned_id,
-    conditioned_record,
+    make_conditioned_id,
+    make_conditioned_record,
 )
 from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
@@ -198,7 +198,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
     solver = ConditionedSolver(problem, link, max_risk, slew_mps3=slew_mps3, cov=cov, filter_plant=estimator_plant)
-    return ConditionedDesign(solver, cov, conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))
+    return ConditionedDesign(solver, cov, make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))
 
 
 def _build_planned_inputs(config: Config) -> Polytope:
@@ -293,7 +293,7 @@ def compute_reference_limits(design: AnyDesign) -> Array:
 def make_design_record(design: AnyDesign) -> dict[str, object]:
     """Return a design of either scheme as plain numbers."""
     if isinstance(design, ConditionedDesign):
-        return conditioned_record(design)
+        return make_conditioned_record(design)
     from uavctl.smpc.hahn_stursberg.design import design_record
 
     return design_record(design)
@@ -396,7 +396,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
         late_steps=design.horizon if outside or isinstance(design, ConditionedDesign) else len(design.late),
         envelope=build_envelope(config, plant),
         estimator=build_estimator(config),
-        inputs=(np.array(config.sets.input_lower), np.array(config.sets.input_upper)),
+        input_bounds=(np.array(config.sets.input_lower), np.array(config.sets.input_upper)),
         fallback=FallbackParameters(
             brake_gain_1ps=fallback.brake_gain_1ps,
             brake_s=fallback.brake_s,

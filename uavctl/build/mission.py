@@ -12,8 +12,8 @@ from uavctl.config.mission import FenceConfig, TrajectoryConfig
 from uavctl.config.types import Config
 from uavctl.constraint_names import ConstraintNames, name_constraints
 from uavctl.errors import DesignError
-from uavctl.flight.mission import Fence, Mission, Room, Trajectory, Waypoint, make_hold_mission
-from uavctl.flight.trajectory import PlantMotion, follow_positions, make_room, plan_along
+from uavctl.flight.mission import Fence, Mission, RestRegion, Trajectory, Waypoint, make_hold_mission
+from uavctl.flight.trajectory import PlantMotion, follow_positions, make_rest_region, plan_along
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope, find_equilibria
@@ -41,7 +41,7 @@ def build_mission(config: Config, design: AnyDesign, reference_limits: Array) ->
         design.state_set.b,
         horizon=design.horizon,
         dt_ns=round(plant.dt_s * SECOND_NS),
-        room=_build_room(design, reference_limits),
+        rest_region=_build_rest_region(design, reference_limits),
     )
     if mission_config.waypoints:
         holds_s = (
@@ -140,10 +140,10 @@ def build_reference_limits(design: Design) -> Array:
     return reference_limits
 
 
-def _build_room(design: AnyDesign, reference_limits: Array) -> Room | None:
+def _build_rest_region(design: AnyDesign, reference_limits: Array) -> RestRegion | None:
     try:
         reference_range = compute_reference_range(design.plant, design.state_set, reference_limits)
-        return make_room(design.plant, design.arrival_stage, *reference_range)
+        return make_rest_region(design.plant, design.arrival_stage, *reference_range)
     except DesignError:
         return None
 

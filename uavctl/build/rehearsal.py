@@ -219,7 +219,9 @@ def _make_rehearsal_start(config: Config, design: ConditionedDesign, mission: Mi
     if mission.trajectory is not None:
         return np.array(mission.trajectory.states[0])
     start_state = make_start_state(config, design.plant)
-    return np.array(start_state if mission.room is None else mission.room.stopped(_make_vector(start_state)))
+    return np.array(
+        start_state if mission.rest_region is None else mission.rest_region.find_stop(_make_vector(start_state))
+    )
 
 
 def _sample_late_steps(config: Config, design: ConditionedDesign) -> NDArray[np.intp]:

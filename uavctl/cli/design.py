@@ -40,7 +40,7 @@ from uavctl.errors import UsageError
 from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign, conditioned_record
+from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign, make_conditioned_record
 from uavctl.smpc.hahn_stursberg.design import Design, design_record
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 
@@ -119,7 +119,7 @@ def design(
             conditioned = build_conditioned(loaded.config)
             rehearsal = rehearse_mission(loaded.config, conditioned)
         figures = {
-            **conditioned_record(conditioned),
+            **make_conditioned_record(conditioned),
             "rehearsal": msgspec.to_builtins(rehearsal),
             "wall_s": time.perf_counter() - begin_s,
         }

@@ -104,15 +104,15 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
         raise UsageError("take-off: the plant has no vertical axis, so it cannot tell how high it is; see plant.axes")
     if take_off_m is None and goal is None:
         return
-    room = build_mission(config, design, compute_reference_limits(design)).room
-    if room is None:
+    region = build_mission(config, design, compute_reference_limits(design)).rest_region
+    if region is None:
         raise UsageError("take-off, goto: this plant cannot rest wherever it is sent; see plant")
-    refusal = "" if goal is None else room.refusal(goal)
+    refusal = "" if goal is None else region.describe_refusal(goal)
     if refusal:
         raise UsageError(f"goto: {refusal}")
     if take_off_m is None:
         return
-    highest_m = -float(room.lower[room.axes.index(DOWN)])
+    highest_m = -float(region.lower[region.axes.index(DOWN)])
     if take_off_m > highest_m:
         raise UsageError(f"take-off to {take_off_m:g} m: above {highest_m:.2f} m it may not rest (sets.state_lower)")
 

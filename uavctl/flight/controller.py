@@ -42,7 +42,7 @@ class Controller:
     late_steps: int = 0  # age of a position up to which the solver counts it [steps]
     outside: str = ""  # name of the controller of another package that is the solver; empty: it is one of ours
     # Least and largest input (n_u,) that may be sent, bias included; None: those of the design
-    inputs: tuple[Array, Array] | None = None
+    input_bounds: tuple[Array, Array] | None = None
     envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: no monitor of motion runs
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others

@@ -1,11 +1,11 @@
 """Phase 4 of a tick: make a new plan, continue the old one, or fall back.
 
-1. The ends that monitors ask for change the fallback, after the operator's orders did.
-2. A vehicle that is handed over, silent, or takes no setpoints: no plan.
-3. A final fallback, or a verdict to brake: the fallback flies on, or begins.
-4. Else, at a Δt boundary: an age of H is the fallback. A new measurement is a new plan, and so are new inertial data
-   where the solver counts the age. Else the old plan plays out.
-5. Between boundaries, what the last one decided is held.
+1. The operator's orders change the fallback, then verdicts that end the plans, then the operator's stop.
+2. A vehicle that is handed over, is not heard, or takes no setpoints gets no plan.
+3. A final fallback flies on. A verdict to brake begins the fallback.
+4. Otherwise each Δt boundary decides. At an age of H the fallback flies. A new position gives a new plan, and so do new
+   inertial data where the solver counts the age. Without either, the old plan is flown on.
+5. Between boundaries the last decision is held.
 """
 
 from __future__ import annotations
@@ -43,13 +43,14 @@ from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Ve
 from uavctl.smpc.answer import Preview
 
 MISSION_OVER = "the mission is over: landing"
-# Behind a position that is older, and without a velocity of the vehicle's own beside them, inertial data make no plans:
-# nothing would show that they err. With five positions a second and 60 % of them lost, one in ten is older.
-# After a silence: positions correct the vehicle's own velocity in their first second, and are compared with it then.
-REENGAGE_NS = CORRECTS_NS + 400_000_000
-PLANNED_NS = 1_000_000_000
-CARRIES_NS = 200_000_000  # inertial data that are older do not carry the estimate on
-_FINAL = {
+# Positions that come back after a silence correct the vehicle's own velocity in their first second. Then they are
+# compared with it. No plan flies again before this time is over.
+COMPARED_NS = CORRECTS_NS + 400_000_000
+# Age of a position up to which inertial data alone, without the vehicle's own velocity, make a new plan: nothing would
+# show that they err. With five positions a second and 60 % of them lost, one in ten is older.
+MAX_UNCONFIRMED_NS = 1_000_000_000
+MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
+_FINAL_TEXTS = {
     FallbackReason.SOURCE_FAILED: "no position came, and the vehicle's own velocity or inertial data failed",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
     FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
@@ -104,11 +105,11 @@ class _Phase(msgspec.Struct, frozen=True, eq=False):
 def decide(state: ControlState, context: TickContext, supervised: Supervised, ordered: Ordered) -> Decided:
     """Decide what flies: nothing yet, the plan, or the fallback."""
     phase = _Phase(state, context, supervised)
-    begun = _begin(phase, ordered)
-    return _decide_handed_over(begun, phase) or _decide_fallback(begun, phase) or _decide_plan(begun, phase)
+    draft = _apply_requests(phase, ordered)
+    return _decide_handed_over(draft, phase) or _decide_fallback(draft, phase) or _decide_plan(draft, phase)
 
 
-def _begin(phase: _Phase, ordered: Ordered) -> Decided:
+def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
     """Apply what orders, monitors and the operator's stop have changed."""
     state, supervised, at_ns = phase.state, phase.supervised, phase.context.at_ns
     fallback = ordered.fallback
@@ -165,110 +166,110 @@ def _update_biases(phase: _Phase) -> Biases:
     return remember_bias(biases, context.boundary_ns, view.estimate.bias)
 
 
-def _decide_handed_over(begun: Decided, phase: _Phase) -> Decided | None:
-    """Decide for a vehicle that is handed over, stopped, silent, or takes no setpoints; None for any other."""
+def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
+    """Decide for a vehicle that is handed over, stopped, not heard, or takes no setpoints; None for any other."""
     inputs, why_not = phase.context.inputs, phase.context.not_ready_reason
-    at_ns, fallback = phase.context.at_ns, begun.fallback
+    at_ns, fallback = phase.context.at_ns, draft.fallback
     if fallback is not None and fallback.is_over:
-        return _fall_back(begun, fallback, phase, "handed over")
+        return _fall_back(draft, fallback, phase, "handed over")
     is_stopped = inputs.stop or (fallback is not None and fallback.reason is FallbackReason.STOP)
     if why_not and is_stopped:
         ended = Fallback(mode=ControlMode.STOPPED, since_ns=at_ns, reason=FallbackReason.STOP)
-        return replace(begun, plan=None, fallback=ended, reason=f"the operator stopped; {why_not}")
-    if inputs.vehicle is None and begun.mode is not ControlMode.WAIT:
-        return _wait_for_vehicle(begun, fallback or begin_fallback(at_ns), phase)
+        return replace(draft, plan=None, fallback=ended, reason=f"the operator stopped; {why_not}")
+    if inputs.vehicle is None and draft.mode is not ControlMode.WAIT:
+        return _wait_for_vehicle(draft, fallback or begin_fallback(at_ns), phase)
     if why_not:
-        return replace(begun, plan=None, fallback=None, reason=why_not)
+        return replace(draft, plan=None, fallback=None, reason=why_not)
     return None
 
 
-def _decide_fallback(begun: Decided, phase: _Phase) -> Decided | None:
+def _decide_fallback(draft: Decided, phase: _Phase) -> Decided | None:
     """Decide for a final fallback, or a verdict to brake; None without either."""
-    supervised, fallback = phase.supervised, begun.fallback
+    supervised, fallback = phase.supervised, draft.fallback
     if fallback is not None and fallback.is_final:
-        why, breach = _FINAL[fallback.reason], supervised.monitors.breach
+        why, breach = _FINAL_TEXTS[fallback.reason], supervised.monitors.breach
         if fallback.reason is FallbackReason.ENVELOPE and breach is not None:
             why = breach.text
         elif fallback.reason is FallbackReason.CONTROLLER_FAILED:
-            why = begun.fault
-        return _fall_back(begun, fallback, phase, why)
-    if begun.plan is not None and not supervised.brake.is_none:
-        return _fall_back(begun, begin_fallback(phase.context.at_ns), phase, supervised.brake.text)
+            why = draft.fault
+        return _fall_back(draft, fallback, phase, why)
+    if draft.plan is not None and not supervised.brake.is_none:
+        return _fall_back(draft, begin_fallback(phase.context.at_ns), phase, supervised.brake.text)
     return None
 
 
-def _decide_plan(begun: Decided, phase: _Phase) -> Decided:
+def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
     """Decide for a vehicle that takes setpoints, with nothing against a plan."""
     if not phase.context.is_boundary:
-        if begun.fallback is not None:
-            return _fall_back(begun, begun.fallback, phase, "fallback goes on")
-        waiting = begun.plan is None
-        return replace(begun, reason="waits for the next boundary" if waiting else "held until the next boundary")
+        if draft.fallback is not None:
+            return _fall_back(draft, draft.fallback, phase, "fallback goes on")
+        waiting = draft.plan is None
+        return replace(draft, reason="waits for the next boundary" if waiting else "held until the next boundary")
     view, controller, at_ns = phase.view, phase.controller, phase.context.at_ns
     if view.age_steps is None:
         never = view.estimate is None
-        return replace(begun, reason="no position yet" if never else "no position from before this boundary yet")
+        return replace(draft, reason="no position yet" if never else "no position from before this boundary yet")
     if view.age_steps >= controller.horizon:
         reason = f"age of information {view.age_steps} has reached H = {controller.horizon}"
-        return _fall_back(begun, begun.fallback or begin_fallback(at_ns), phase, reason)
+        return _fall_back(draft, draft.fallback or begin_fallback(at_ns), phase, reason)
     wanted = controller.fallback.recover_samples
     resumed_ns = phase.supervised.monitors.engaged.motion.resumed_ns
-    if begun.fallback is not None and resumed_ns is not None and at_ns - resumed_ns < REENGAGE_NS:
+    if draft.fallback is not None and resumed_ns is not None and at_ns - resumed_ns < COMPARED_NS:
         reason = "positions have come back, and their first second is compared"
-        is_fresh = begun.consecutive_samples >= wanted
-        fallback = restart_hold(begun.fallback, at_ns) if is_fresh else begun.fallback
-        return _fall_back(begun, fallback, phase, reason)
-    if begun.fallback is not None and begun.consecutive_samples < wanted:
-        reason = f"{begun.consecutive_samples} of {wanted} fresh samples in a row"
-        return _fall_back(begun, begun.fallback, phase, reason)
+        is_fresh = draft.consecutive_samples >= wanted
+        fallback = restart_hold(draft.fallback, at_ns) if is_fresh else draft.fallback
+        return _fall_back(draft, fallback, phase, reason)
+    if draft.fallback is not None and draft.consecutive_samples < wanted:
+        reason = f"{draft.consecutive_samples} of {wanted} fresh samples in a row"
+        return _fall_back(draft, draft.fallback, phase, reason)
     if phase.supervised.plan_base is None:
-        return replace(begun, reason="no estimate of this boundary")
-    return _plan_from(begun, phase.supervised.plan_base, phase)
+        return replace(draft, reason="no estimate of this boundary")
+    return _plan_from(draft, phase.supervised.plan_base, phase)
 
 
-def _plan_from(begun: Decided, belief: Belief, phase: _Phase) -> Decided:
+def _plan_from(draft: Decided, belief: Belief, phase: _Phase) -> Decided:
     """Plan from the belief at which an input begins to act, unless the mission is over or the controller has failed."""
     controller, context, supervised = phase.controller, phase.context, phase.supervised
     base = make_estimate(controller.kalman, belief, with_cov=False)
-    mission = advance_mission(controller.mission, begun.mission, base.mean, context.boundary_ns)
-    begun = replace(begun, mission=mission)
-    if controller.mission.land and begun.order is None and is_over(controller.mission, mission, context.boundary_ns):
-        landing = request_fallback(begun.fallback, FallbackReason.LAND, context.at_ns)
-        return _fall_back(begun, landing, phase, MISSION_OVER)
-    if not begun.fault and not supervised.wall.is_none:
-        begun = replace(begun, fault=supervised.wall.text)
-    if begun.fault:  # found just now, or the vehicle is flown again after the pilot had it
-        return _give_up_controller(begun, phase)
-    planned = _replan(begun, mission, base, select_covariance(controller.kalman, belief), phase)
+    mission = advance_mission(controller.mission, draft.mission, base.mean, context.boundary_ns)
+    draft = replace(draft, mission=mission)
+    if controller.mission.land and draft.order is None and is_over(controller.mission, mission, context.boundary_ns):
+        landing = request_fallback(draft.fallback, FallbackReason.LAND, context.at_ns)
+        return _fall_back(draft, landing, phase, MISSION_OVER)
+    if not draft.fault and not supervised.wall.is_none:
+        draft = replace(draft, fault=supervised.wall.text)
+    if draft.fault:  # found just now, or the vehicle is flown again after the pilot had it
+        return _give_up_controller(draft, phase)
+    planned = _replan(draft, mission, base, select_covariance(controller.kalman, belief), phase)
     if planned.fault:
         return _give_up_controller(planned, phase)
     if planned.plan is not None and context.step - planned.plan.seq < controller.horizon:
         return planned
-    return _fall_back(planned, begun.fallback or begin_fallback(context.at_ns), phase, "no plan is left to fly")
+    return _fall_back(planned, draft.fallback or begin_fallback(context.at_ns), phase, "no plan is left to fly")
 
 
-def _replan(begun: Decided, mission: MissionState, base: Estimate, cov: Array, phase: _Phase) -> Decided:
-    """Ask for a plan if there is a new measurement, as ordered; else, or if that fails, the old one plays out."""
+def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, phase: _Phase) -> Decided:
+    """Ask for a plan if there is new data, as ordered; without it, or without an answer, the old plan is flown on."""
     controller, context = phase.controller, phase.context
-    before_ns = None if begun.plan is None else begun.superseded_after_ns
+    before_ns = None if draft.plan is None else draft.superseded_after_ns
     new_measurement = before_ns is None or base.captured_ns > before_ns
-    if not new_measurement and not _has_new_inertial(begun.plan, phase):
-        return replace(begun, reason="no news: the plan plays out")
+    if not new_measurement and not _has_new_inertial(draft.plan, phase):
+        return replace(draft, reason="no news: the plan plays out")
     reason = "news: a new plan" if new_measurement else "inertial data: a new plan"
-    if begun.order is not None:
-        reason = f"{reason}, as ordered: {describe_order(begun.order)}"
-    mission = follow_order(controller.mission, mission, begun.order, base.mean, context.boundary_ns)
+    if draft.order is not None:
+        reason = f"{reason}, as ordered: {describe_order(draft.order)}"
+    mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
     mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
     target, preview = make_question(controller.mission, mission, context.boundary_ns)
     preview = _complete_preview(preview, base, cov, phase)
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask_solver(controller.solver, context.step, base, target, preview, shape, controller.design_id)
-    begun = replace(begun, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
+    draft = replace(draft, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
     if asked.plan is None:
         reason = "no new plan: the old one plays out"
-        return replace(begun, reason=reason, fault=asked.fault, trouble=asked.text)
+        return replace(draft, reason=reason, fault=asked.fault, trouble=asked.text)
     return replace(
-        begun,
+        draft,
         plan=asked.plan,
         superseded_after_ns=asked.plan.captured_ns,
         fallback=None,
@@ -288,15 +289,16 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
         age=min(phase.view.age_steps or 0, controller.late_steps),
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
-        inputs=_shift_inputs(base.bias, controller),
+        input_bounds=_shift_input_bounds(base.bias, controller),
     )
 
 
-def _shift_inputs(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
-    """Return the inputs that a plan has beside a bias, in its own count; None where the design left room for it."""
-    if controller.inputs is None or not bias or max(map(abs, bias)) <= controller.estimator.bias_max:
+def _shift_input_bounds(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
+    """Return the least and largest input of a plan, bias included; None where the design has a margin for the bias."""
+    if controller.input_bounds is None or not bias or max(map(abs, bias)) <= controller.estimator.bias_max:
         return None
-    low, high = controller.inputs
+    low, high = controller.input_bounds
+    # u = u_sent + d
     return low + bias, high + bias
 
 
@@ -307,60 +309,60 @@ def _has_new_inertial(plan: Plan | None, phase: _Phase) -> bool:
         return False
     inputs, belief = context.inputs, view.belief
     alone = find_confirmed_velocity(phase.supervised.monitors.engaged, inputs.motion, inputs.at_ns) is None
-    if alone and belief is not None and context.boundary_ns - belief.captured_ns > PLANNED_NS:
+    if alone and belief is not None and context.boundary_ns - belief.captured_ns > MAX_UNCONFIRMED_NS:
         return False
     newest_ns = None if belief is None else belief.inertial.used_ns
     return newest_ns is not None and newest_ns > plan.base_ns - controller.dead_ns
 
 
-def _give_up_controller(begun: Decided, phase: _Phase) -> Decided:
+def _give_up_controller(draft: Decided, phase: _Phase) -> Decided:
     """Let the fallback fly for good: the controller of another package has failed."""
-    fallback = request_fallback(begun.fallback, FallbackReason.CONTROLLER_FAILED, phase.context.at_ns)
-    return _fall_back(begun, fallback, phase, begun.fault)
+    fallback = request_fallback(draft.fallback, FallbackReason.CONTROLLER_FAILED, phase.context.at_ns)
+    return _fall_back(draft, fallback, phase, draft.fault)
 
 
-def _fall_back(begun: Decided, fallback: Fallback, phase: _Phase, reason: str) -> Decided:
+def _fall_back(draft: Decided, fallback: Fallback, phase: _Phase, reason: str) -> Decided:
     """Let the fallback fly, and advance it; the count of fresh samples starts anew where it begins."""
-    before, fallback = fallback, _advance(begun, fallback, phase)
+    before, fallback = fallback, _advance(draft, fallback, phase)
     if fallback.mode is ControlMode.LAND and not fallback.is_final:
         held_s = (phase.context.at_ns - (before.held_ns or phase.context.at_ns)) * 1e-9
         reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
-    consecutive = 0 if begun.fallback is None else begun.consecutive_samples
+    consecutive = 0 if draft.fallback is None else draft.consecutive_samples
     hold_point_m = None
     if fallback.mode is ControlMode.HOLD:
-        hold_point_m = begun.hold_point_m
+        hold_point_m = draft.hold_point_m
         if hold_point_m is None:
             hold_point_m = read_position(phase.view.estimate, phase.controller.plant)
     return replace(
-        begun, plan=None, fallback=fallback, consecutive_samples=consecutive, hold_point_m=hold_point_m, reason=reason
+        draft, plan=None, fallback=fallback, consecutive_samples=consecutive, hold_point_m=hold_point_m, reason=reason
     )
 
 
-def _wait_for_vehicle(begun: Decided, fallback: Fallback, phase: _Phase) -> Decided:
-    """Let the fallback's time run on while the vehicle is silent.
+def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Decided:
+    """Let the fallback's time run on while the vehicle is not heard.
 
     Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime. Where it is due
     nothing is sent, so that a vehicle that still listens lands by its own failsafe.
     """
     inputs = phase.context.inputs
-    later = _advance(begun, fallback, phase)
+    later = _advance(draft, fallback, phase)
     unheard = (
         "the vehicle's heartbeats are missing" if moves_now(inputs.motion, inputs.at_ns) else "no vehicle is heard"
     )
-    consecutive = 0 if begun.fallback is None else begun.consecutive_samples
+    consecutive = 0 if draft.fallback is None else draft.consecutive_samples
     if later.is_over:
         reason = f"{unheard}, and the time to hold is over: its own failsafe is left to act"
         due = fallback
         if not fallback.is_final:
             due = Fallback(mode=fallback.mode, since_ns=fallback.since_ns, reason=FallbackReason.LAND)
         return replace(
-            begun, plan=None, fallback=due, consecutive_samples=consecutive, reason=reason, sends_nothing=True
+            draft, plan=None, fallback=due, consecutive_samples=consecutive, reason=reason, sends_nothing=True
         )
     reason = f"{unheard}; the fallback's time runs on"
-    return replace(begun, plan=None, fallback=later, consecutive_samples=consecutive, reason=reason)
+    return replace(draft, plan=None, fallback=later, consecutive_samples=consecutive, reason=reason)
 
 
-def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
+def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     """Advance the fallback to this tick."""
     state, context, view = phase.state, phase.context, phase.view
     moving, measured = find_braking_velocity(state, context, phase.supervised)
@@ -371,10 +373,10 @@ def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
         math.hypot(*moving),
         state.plan.sent_mps2,
         context.controller.fallback,
-        find_hold_accel(fallback, begun.biases, context, phase.supervised),
-        measured=measured,
-        predicted=is_predicted and are_positions_lost(view.belief, context.at_ns),
-        blind=is_predicted and (view.age_steps is None or view.age_steps >= context.controller.horizon),
+        find_hold_accel(fallback, draft.biases, context, phase.supervised),
+        is_measured=measured,
+        is_open_loop=is_predicted and are_positions_lost(view.belief, context.at_ns),
+        is_blind=is_predicted and (view.age_steps is None or view.age_steps >= context.controller.horizon),
     )
 
 
@@ -389,17 +391,17 @@ def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
     """Whether the vehicle's own inertial data carry the estimate on, with nothing against it."""
     if belief is None or belief.inertial.used_ns is None or belief.inertial.distrusted_ns is not None:
         return False
-    return not fallback.is_final and belief.at_ns - belief.inertial.used_ns <= CARRIES_NS
+    return not fallback.is_final and belief.at_ns - belief.inertial.used_ns <= MAX_INERTIAL_AGE_NS
 
 
 def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, supervised: Supervised) -> Vec3:
     """Find the setpoint [m/s²] at which the vehicle does not accelerate: against the bias, if known; else zero."""
     inputs, view = context.inputs, supervised.view
     bias = find_lasting_bias(biases)
-    # A bias learnt without positions may be an error of the inertial data, and would be flown for seconds: it counts
-    # where the vehicle's own velocity would contradict.
-    witnessed = find_confirmed_velocity(supervised.monitors.engaged, inputs.motion, inputs.at_ns) is not None
-    if witnessed and view.estimate is not None and carries_estimate(fallback, view.belief):
+    # Without positions, an estimated bias may be an error of the inertial data, and would be flown for seconds.
+    # It counts only where the vehicle's own velocity is there to contradict it.
+    is_confirmed = find_confirmed_velocity(supervised.monitors.engaged, inputs.motion, inputs.at_ns) is not None
+    if is_confirmed and view.estimate is not None and carries_estimate(fallback, view.belief):
         bias = view.estimate.bias
     # The vehicle keeps zero itself when nothing more is sent.
     is_last = fallback.is_final and fallback.mode is ControlMode.HOLD

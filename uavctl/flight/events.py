@@ -19,7 +19,7 @@ from uavctl.flight.context import TickContext
 from uavctl.flight.decide import Decided
 from uavctl.flight.estimator import find_newest_belief
 from uavctl.flight.fallback import Fallback, FallbackReason
-from uavctl.flight.link_estimate import LinkBelief, count_step, estimate_link
+from uavctl.flight.link_estimate import LinkCounts, count_step, estimate_link
 from uavctl.flight.measure import Measured
 from uavctl.flight.monitors.acceleration import describe_push
 from uavctl.flight.monitors.engaged import MonitorState
@@ -28,7 +28,9 @@ from uavctl.flight.state import AlarmGroup, ControlState
 from uavctl.flight.supervise import Supervised
 from uavctl.records import ControlMode, Event, LinkEstimate, Severity, Vec3
 
-FREE = 0.9  # share of its bound below which a bias no longer is at it: one that settles there is reported once
+BELOW_BOUND_SHARE = (
+    0.9  # share of its bound below which a bias no longer is at it: one that settles there is reported once
+)
 SILENT_NS = 1_000_000_000  # without inertial data
 ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for and begin
 
@@ -77,7 +79,7 @@ def report_events(
 ) -> Reported:
     """Report what has changed in a tick."""
     before, at_ns = state.alarms, context.at_ns
-    belief, link = _count_link(before.link, context, supervised)
+    counts, link = _count_link(before.link, context, supervised)
     link_alarms = before.link_alarms if link is None else _find_link_alarms(link, before.link_alarms)
     bias = _find_bias(context, supervised)
     inputs_at_bound = before.inputs_at_bound
@@ -96,7 +98,7 @@ def report_events(
         push_mps2 = context.controller.plant.to_accel(np.array(bias))
         events += report_bias(push_mps2, before.inputs_at_bound, inputs_at_bound, at_ns)
     events += _report_push(state.monitors.engaged, supervised.monitors.engaged, context)
-    return Reported(events, AlarmGroup(belief, link_alarms, inertial, inputs_at_bound), link)
+    return Reported(events, AlarmGroup(counts, link_alarms, inertial, inputs_at_bound), link)
 
 
 def _make_event(at_ns: int, severity: Severity, code: str, text: str, count: int = 1, subject: str = "") -> Event:
@@ -137,7 +139,7 @@ def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -
     if plan is not None and plan.gave_way:
         text = describe_all_relaxed(context.controller.names, plan.gave_way)
         yield _make_event(at_ns, Severity.WARNING, EventCode.RELAXED, text)
-    is_mission_over = _lands(decided.fallback) and not _lands(ordered.fallback)
+    is_mission_over = _is_landing_final(decided.fallback) and not _is_landing_final(ordered.fallback)
     if mode is not context.mode or is_mission_over:
         severity, code = _ENTERED[mode]
         if decided.fallback is not None and decided.fallback.reason >= FallbackReason.STOP:
@@ -146,19 +148,19 @@ def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -
         yield _make_event(at_ns, severity, code, decided.reason, subject=subject)
 
 
-def _lands(fallback: Fallback | None) -> bool:
+def _is_landing_final(fallback: Fallback | None) -> bool:
     return fallback is not None and fallback.reason is FallbackReason.LAND
 
 
 def _count_link(
-    belief: LinkBelief, context: TickContext, supervised: Supervised
-) -> tuple[LinkBelief, LinkEstimate | None]:
+    counts: LinkCounts, context: TickContext, supervised: Supervised
+) -> tuple[LinkCounts, LinkEstimate | None]:
     """Count the step that ends here for the link; return the counts, and the estimate if this is a boundary on time."""
     age_steps, at_ns = supervised.view.age_steps, context.at_ns
     if not context.is_boundary or age_steps is None or at_ns != context.boundary_ns:
-        return belief, None
-    belief = count_step(belief, age_steps == 0, context.controller.link)
-    return belief, estimate_link(belief, context.controller.link, at_ns)
+        return counts, None
+    counts = count_step(counts, age_steps == 0, context.controller.link)
+    return counts, estimate_link(counts, context.controller.link, at_ns)
 
 
 def _find_link_alarms(link: LinkEstimate, reported: tuple[str, ...]) -> tuple[str, ...]:
@@ -217,7 +219,7 @@ def find_inputs_at_bound(bias: Sequence[float], bounds: Sequence[float], reporte
     return tuple(
         i
         for i, (value, bound) in enumerate(zip(bias, bounds, strict=False))
-        if abs(value) >= (FREE * bound if i in reported else bound)
+        if abs(value) >= (BELOW_BOUND_SHARE * bound if i in reported else bound)
     )
 
 

@@ -16,8 +16,8 @@ A state machine of four modes, each with a time limit:
 1. Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.monitors.vehicle_velocity`),
    else by the predicted one. By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold
    runs on.
-2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. A prediction
-   that nothing measures is braked on only until it is slow.
+2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. By a
+   prediction from inputs alone the vehicle brakes only until that is slow.
 3. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.
 4. The way back to TRACK, from BRAKE and HOLD with reason RECOVER only, is decided at Δt boundaries
    (`uavctl.flight.decide`).
@@ -34,8 +34,8 @@ from uavctl.records import ControlMode, Vec3
 
 SETTLE_S = 1.0  # longest time in which the setpoint limiter reaches zero
 STILL_MPS = 0.02  # below this speed the vehicle is at rest
-# The same of a prediction that nothing measures: it is no better than this. An error would be braked on for seconds.
-PREDICTED_STILL_MPS = 0.1
+# The same of a prediction by inputs alone: it is no better than this. An error would be braked on for seconds.
+OPEN_LOOP_STILL_MPS = 0.1
 DRIFT_MPS = 0.15  # above this speed, by its own velocity, a vehicle that holds drifts
 CALM_MPS2 = 0.04  # HOLD begins when the setpoint is this close to its own
 RETURN_GAIN_1PS2, RETURN_GAIN_1PS = 1.0, 1.5  # gains of distance and speed on the way back: two seconds
@@ -63,7 +63,7 @@ class FallbackReason(IntEnum):
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
     ENVELOPE = auto()  # a monitor found the motion impossible: no plan again, and no braking
-    STOP = auto()  # the operator's stop
+    STOP = auto()  # the operator's stop (Ctrl-C), or the end of the time to fly
     LAND = auto()  # an order to land, or the mission is over: it lands whatever `fallback.land` says
 
 
@@ -104,7 +104,7 @@ def request_fallback(fallback: Fallback | None, reason: FallbackReason, at_ns: i
 
 
 def restart_hold(fallback: Fallback, at_ns: int) -> Fallback:
-    """Let the time to hold begin again: positions are back, and are compared before plans fly again."""
+    """Restart the time to hold: positions are back, and are compared before plans fly again."""
     return fallback if fallback.held_ns is None else replace(fallback, held_ns=at_ns)
 
 
@@ -116,9 +116,9 @@ def advance_fallback(
     parameters: FallbackParameters,
     hold_accel_mps2: Vec3 = ZERO,
     *,
-    measured: bool = False,
-    predicted: bool = False,
-    blind: bool = False,
+    is_measured: bool = False,
+    is_open_loop: bool = False,
+    is_blind: bool = False,
 ) -> Fallback:
     """Advance the fallback to `at_ns`, with all transitions that are due.
 
@@ -127,9 +127,9 @@ def advance_fallback(
         speed_mps: Speed now [m/s]; NaN counts as moving.
         sent_mps2: The setpoint of the tick before [m/s²].
         hold_accel_mps2: What HOLD sends [m/s²].
-        measured: Whether the speed is the vehicle's own velocity, not a prediction.
-        predicted: Whether it is a prediction that no recent position, and no inertial data, carry on.
-        blind: Whether it is a prediction without a recent position: nothing shows a drift.
+        is_measured: Whether the speed is the vehicle's own velocity, not a prediction.
+        is_open_loop: Whether it is a prediction that no recent position, and no inertial data, carry on.
+        is_blind: Whether it is a prediction without a recent position: nothing shows a drift.
     """
     mode = fallback.mode
     if mode is ControlMode.STOPPED:
@@ -138,12 +138,12 @@ def advance_fallback(
         return replace(fallback, mode=ControlMode.STOPPED, since_ns=at_ns)
     elapsed_s = (at_ns - fallback.since_ns) * 1e-9
     held_ns = fallback.since_ns if fallback.held_ns is None else fallback.held_ns
-    hold_s = min(parameters.hold_s, parameters.blind_hold_s) if blind else parameters.hold_s
+    hold_s = min(parameters.hold_s, parameters.blind_hold_s) if is_blind else parameters.hold_s
     due = (mode is ControlMode.HOLD or fallback.held_ns is not None) and (at_ns - held_ns) * 1e-9 >= hold_s
     if mode is ControlMode.BRAKE and not due:
-        slow = speed_mps < (PREDICTED_STILL_MPS if predicted else STILL_MPS) or elapsed_s >= parameters.brake_s
+        slow = speed_mps < (OPEN_LOOP_STILL_MPS if is_open_loop else STILL_MPS) or elapsed_s >= parameters.brake_s
         off_mps2 = max(abs(sent - held) for sent, held in zip(sent_mps2, hold_accel_mps2, strict=True))
-        if slow and (predicted or off_mps2 <= CALM_MPS2 or elapsed_s >= parameters.brake_s + SETTLE_S):
+        if slow and (is_open_loop or off_mps2 <= CALM_MPS2 or elapsed_s >= parameters.brake_s + SETTLE_S):
             held_ns = at_ns if fallback.held_ns is None else held_ns
             return replace(fallback, mode=ControlMode.HOLD, since_ns=at_ns, held_ns=held_ns)
         return fallback
@@ -153,7 +153,7 @@ def advance_fallback(
         after = _follow_hold(fallback.reason, parameters.land)
         if after is not ControlMode.HOLD:
             return replace(fallback, mode=after, since_ns=at_ns)
-    if mode is ControlMode.HOLD and measured and not fallback.is_final and speed_mps > DRIFT_MPS:
+    if mode is ControlMode.HOLD and is_measured and not fallback.is_final and speed_mps > DRIFT_MPS:
         return replace(fallback, mode=ControlMode.BRAKE, since_ns=at_ns)
     return fallback
 

@@ -29,8 +29,8 @@ from uavctl.smpc.estimate import add_bias, add_gauss_markov, force_jump
 from uavctl.smpc.plant import Plant
 
 # Only inertial data show a bias that drifts fast. Positions alone show it late, with their noise and the model's
-# errors in it: in a silence this flew a vehicle 6 m out, against a wind that was none. So the bias drifts a tenth as
-# fast while no inertial data are used, and from this long after the newest ones on.
+# errors in it. Without positions a vehicle flew 6 m out, against a wind that did not exist. So the bias drifts a tenth
+# as fast while no inertial data are used, and from this long after the newest ones on.
 DRIFT_WITHOUT_INERTIAL, INERTIAL_LASTS_NS = 0.1, 1_000_000_000
 SETTLES_NS = 40_000_000_000  # time in which covariances settle
 RELEARN_STD_MPS = 0.2  # standard deviation of a velocity error that inertial data may have left behind

@@ -1,4 +1,4 @@
-"""The setpoint limiter on a setpoint: finite, bounded, slew-limited; knows nothing of what asked for it."""
+"""Setpoint limiter: any acceleration becomes finite, bounded and slew-limited, whatever has asked for it."""
 
 from __future__ import annotations
 

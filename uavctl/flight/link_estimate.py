@@ -40,7 +40,7 @@ class LinkEstimateParameters:
         return -float(ndtri(self.false_alarm))
 
 
-class LinkBelief(msgspec.Struct, frozen=True):
+class LinkCounts(msgspec.Struct, frozen=True):
     """Counts that one boundary leaves to the next; old observations are forgotten gradually."""
 
     arrived: float = 0.0  # steps with news
@@ -51,31 +51,31 @@ class LinkBelief(msgspec.Struct, frozen=True):
     last: bool | None = None  # whether the last step had news; None before the first one
 
 
-NO_COUNTS = LinkBelief()
+NO_COUNTS = LinkCounts()
 
 
-def count_step(belief: LinkBelief, arrived: bool, parameters: LinkEstimateParameters) -> LinkBelief:
+def count_step(counts: LinkCounts, arrived: bool, parameters: LinkEstimateParameters) -> LinkCounts:
     """Take the observation of one boundary.
 
     Args:
         arrived: Whether at least one position captured in the Δt that ends here is there.
     """
     weight = parameters.forgetting
-    pairs = [weight * count for count in belief.pairs]
-    squares = weight**2 * belief.squares
-    if belief.last is not None:
-        pairs[2 * (not belief.last) + (not arrived)] += 1.0
+    pairs = [weight * count for count in counts.pairs]
+    squares = weight**2 * counts.squares
+    if counts.last is not None:
+        pairs[2 * (not counts.last) + (not arrived)] += 1.0
         squares += 1.0
-    return LinkBelief(
-        arrived=weight * belief.arrived + arrived,
-        lost=weight * belief.lost + (not arrived),
+    return LinkCounts(
+        arrived=weight * counts.arrived + arrived,
+        lost=weight * counts.lost + (not arrived),
         pairs=(pairs[0], pairs[1], pairs[2], pairs[3]),
         squares=squares,
         last=arrived,
     )
 
 
-def estimate_link(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns: int) -> LinkEstimate:
+def estimate_link(counts: LinkCounts, parameters: LinkEstimateParameters, at_ns: int) -> LinkEstimate:
     """Return the link estimate at `at_ns`.
 
     The mean is that of Jeffreys' prior, Beta(½, ½), and the counts' posterior, whose quantiles hold their level on
@@ -86,15 +86,15 @@ def estimate_link(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns:
     independent ones, by (1 - r) / (1 + r) with r the correlation of a step with the next (the variance of the mean
     of a two-state chain).
     """
-    statistic, correlation = compute_burst_statistic(belief), _correlation(belief)
+    statistic, correlation = compute_burst_statistic(counts), _compute_correlation(counts)
     bursts = statistic > parameters.burst_threshold
     share = (1.0 - correlation) / (1.0 + correlation) if bursts else 1.0
-    arrived, lost = share * belief.arrived, share * belief.lost
+    arrived, lost = share * counts.arrived, share * counts.lost
     return LinkEstimate(
         at_ns=at_ns,
-        arrived=belief.arrived,
-        lost=belief.lost,
-        arrival_mean=(belief.arrived + 0.5) / (belief.arrived + belief.lost + 1.0),
+        arrived=counts.arrived,
+        lost=counts.lost,
+        arrival_mean=(counts.arrived + 0.5) / (counts.arrived + counts.lost + 1.0),
         arrival_lower=float(betaincinv(arrived, lost + 1.0, 1.0 - parameters.credible)) if arrived else 0.0,
         credible=parameters.credible,
         burst_statistic=statistic,
@@ -104,29 +104,29 @@ def estimate_link(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns:
     )
 
 
-def compute_burst_statistic(belief: LinkBelief) -> float:
+def compute_burst_statistic(counts: LinkCounts) -> float:
     """Signed root of the likelihood ratio of a first-order Markov chain against independence.
 
     G² = 2 Σ n_ij log(n_ij n / (n_i. n_.j)) of the transition counts is χ² with one degree of freedom without
     forgetting; with weights w its scale is Σ w² / Σ w. The sign is that of the correlation: a loss after a loss is
     more likely than after an arrival.
     """
-    n00, n01, n10, n11 = belief.pairs
-    total = sum(belief.pairs)
+    n00, n01, n10, n11 = counts.pairs
+    total = sum(counts.pairs)
     if not total:
         return 0.0
     row, column = (n00 + n01, n10 + n11), (n00 + n10, n01 + n11)
     cells = ((n00, row[0] * column[0]), (n01, row[0] * column[1]), (n10, row[1] * column[0]), (n11, row[1] * column[1]))
     g2 = 2.0 * sum([n * math.log(n * total / expected) for n, expected in cells if n])
-    return math.copysign(math.sqrt(max(0.0, g2) * total / belief.squares), _correlation(belief))
+    return math.copysign(math.sqrt(max(0.0, g2) * total / counts.squares), _compute_correlation(counts))
 
 
-def _correlation(belief: LinkBelief) -> float:
+def _compute_correlation(counts: LinkCounts) -> float:
     """Correlation of a step's loss with the next one's, by the transition counts with Jeffreys' prior.
 
     The prior keeps an outage that has not ended from being taken for a single observation.
     """
-    n00, n01, n10, n11 = belief.pairs
+    n00, n01, n10, n11 = counts.pairs
     return (n11 + 0.5) / (n10 + n11 + 1.0) - (n01 + 0.5) / (n00 + n01 + 1.0)
 
 

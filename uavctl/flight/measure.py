@@ -4,8 +4,8 @@ The monitors of single samples run here (frozen sources, outliers); all others r
 
 1. Inputs that begin to act are noted in the filter.
 2. A sample that is invalid is refused. Each other one is compared with what is known, in the order of capture: frozen
-   sources first, then outliers, then jumps (`uavctl.flight.monitors`). What is refused is as good as lost. What counts
-   has the measured noise as standard deviation, and is less the shift of jumps.
+   sources first, then outliers, then jumps (`uavctl.flight.monitors`). What is refused counts as lost. An
+   accepted sample gets the measured noise as standard deviation, and the shift of jumps is taken off it.
 3. A source that is found to be frozen: its samples since then are dropped again.
 4. A source has moved while nobody flew on its positions: the filter begins anew.
 5. Inertial data of the tick update the filter, as their mean.
@@ -55,7 +55,7 @@ from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.flight.state import ControlState, InertialReading, SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleStatus
 
-# A plan bridges H steps; a sample that used up no more than this part of them on its way leaves most of them to it.
+# A plan bridges H steps. A sample is fresh up to an age of H divided by this: most of the steps are left to the plan.
 _FRESH_PART = 3
 
 
@@ -69,7 +69,8 @@ class GatedSamples(msgspec.Struct, frozen=True, eq=False):
     dropped_after_ns: int | None = None  # samples captured after this have been dropped again [ns]; None if none were
     consecutive_samples: int = 0  # fresh samples in a row, up to now
     source_moved: bool = False  # whether a source has moved: no position may be believed any more
-    all_absurd: bool = False  # whether all positions are further out than any can be, for so long that the same holds
+    # Whether all positions are further out than any can be, for so long that none may be believed any more
+    all_absurd: bool = False
 
 
 class Measured(msgspec.Struct, frozen=True, eq=False):
@@ -193,9 +194,9 @@ def _gate_in_order(
             first = frozen.track_sample(sources.tracks, kalman, history, sample, np.zeros(len(kalman.axes)))
             sources = replace(sources, tracks=first)
         sources = replace(sources, jumps=jumps.note_position(sources.jumps, at_ns))
-        counted = _prepare_sample(sources, sample, at_ns)
+        corrected = _correct_sample(sources, sample, at_ns)
         if belief is not None:  # else it is the first one, or too old
-            sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, counted, belief)
+            sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, corrected, belief)
             if verdict.cause is not None:
                 code = verdict.cause.value
                 if verdict.since_ns is not None:
@@ -207,12 +208,12 @@ def _gate_in_order(
                     accepted = [other for other in accepted if not is_distrusted(other)]
                 refused.append((sample, code))
                 continue
-            counted = _prepare_sample(sources, sample, at_ns)
-        history, reason = insert_sample(kalman, history, counted, belief)
+            corrected = _correct_sample(sources, sample, at_ns)
+        history, reason = insert_sample(kalman, history, corrected, belief)
         if reason is None:
             if belief is None:
                 sources = replace(sources, noise=noise.update(sources.noise, sample, at_ns))
-            accepted.append(counted)
+            accepted.append(corrected)
         else:
             refused.append((sample, reason))
     sources = replace(sources, absurd=_track_absurd(sources.absurd, kalman, bool(accepted), refused))
@@ -250,8 +251,8 @@ def _drop_distrusted(
 ) -> tuple[FilterHistory, int | None]:
     """Drop the samples of a frozen source since `first_ns`; return too the time after which any were dropped so far.
 
-    The value that first came then goes too: it may be an older one, which the link had lost when it was new. It stays
-    where nothing else is known.
+    The sample at `first_ns` is dropped, too: it may repeat a value whose first sample the link has lost. It stays where
+    no other position is known.
     """
     cleaned = drop_samples(history, is_distrusted)
     last_ns = find_newest_capture_ns(kalman, cleaned, first_ns)
@@ -270,18 +271,18 @@ def _judge_sample(
     sources: SourceHealth,
     inputs: StepInput,
     sample: PositionSample,
-    counted: PositionSample,
+    corrected: PositionSample,
     belief: Belief,
 ) -> tuple[SourceHealth, Verdict]:
     """Compare a sample with what is known.
 
     Args:
         sample: The sample as it came.
-        counted: The same with the noise that positions have, less their jumps.
+        corrected: The same with the measured noise, less the shift of jumps.
         belief: The prediction for its capture time.
     """
     at_ns, n_axes = read_capture_ns(sample), len(kalman.axes)
-    values, variances = read_measurement(kalman, replace(counted, std_m=sample.std_m))
+    values, variances = read_measurement(kalman, replace(corrected, std_m=sample.std_m))
     # ν = y - H z
     offset = values - belief.mean[kalman.measured_index[: len(values)]]
     observation = PredictedSample(
@@ -306,15 +307,15 @@ def _judge_sample(
         )
         if not sources.noise.is_known:
             return sources, NO_VERDICT
-        return _judge_jump(kalman, sources, offset, _prepare_sample(sources, sample, at_ns), belief)
+        return _judge_jump(kalman, sources, offset, _correct_sample(sources, sample, at_ns), belief)
     if frozen.is_repeat(tracks[sample.source], at_ns):
-        # A value that came before did not jump: the prediction has moved away from a source that is frozen.
+        # A repeated value did not jump: the prediction has moved away from a source that is frozen.
         return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN)
     return replace(sources, outliers=outlier_track), verdict
 
 
-def _prepare_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -> PositionSample:
-    """Return a sample with the noise that positions have, less their jumps."""
+def _correct_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -> PositionSample:
+    """Return a sample with the measured noise as standard deviation, less the shift of jumps."""
     std_m, shift_m = max(sample.std_m, sources.noise.std_m), sources.jumps.compute_shift_m(at_ns)
     if std_m == sample.std_m and not any(shift_m):
         return sample
@@ -323,18 +324,18 @@ def _prepare_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -
 
 
 def _judge_jump(
-    kalman: Kalman, sources: SourceHealth, offset: Array, counted: PositionSample, belief: Belief
+    kalman: Kalman, sources: SourceHealth, offset: Array, corrected: PositionSample, belief: Belief
 ) -> tuple[SourceHealth, Verdict]:
     """Judge whether a sample inside the gate belongs to another solution of the camera system."""
-    at_ns, n_axes = read_capture_ns(counted), len(kalman.axes)
+    at_ns, n_axes = read_capture_ns(corrected), len(kalman.axes)
     index, offset_m = kalman.measured_index[:n_axes], [0.0, 0.0, 0.0]
     for axis, value in zip(kalman.axes, offset.tolist(), strict=False):
         offset_m[axis] = value
     # √(H P H' + R)
-    spread_m = np.sqrt(belief.cov.diagonal()[index] + compute_position_variance(kalman.parameters, counted))
+    offset_std_m = np.sqrt(belief.cov.diagonal()[index] + compute_position_variance(kalman.parameters, corrected))
     north, east, down = offset_m
     age_s = (at_ns - belief.captured_ns) * 1e-9
-    track, outcome = jumps.update(sources.jumps, (north, east, down), spread_m, at_ns, age_s)
+    track, outcome = jumps.update(sources.jumps, (north, east, down), offset_std_m, at_ns, age_s)
     sources = replace(sources, jumps=track)
     if outcome is jumps.Outcome.COUNTS:
         return sources, NO_VERDICT

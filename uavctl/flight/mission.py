@@ -16,8 +16,8 @@ from uavctl.records import Vec3, Vector
 from uavctl.smpc.answer import Path, Preview
 from uavctl.smpc.plant import AXES
 
-LEADS_M = 0.5  # of way in each of two horizontal axes: one of them leads
-PUSHED_M = 0.3  # by more than this an axis that may not rest where it is moves from the start, and so it leads
+LEADS_M = 0.5  # with a longer way than this in both horizontal axes, one of them leads
+PUSHED_M = 0.3  # an axis that stops further than this outside the region moves from the start, and so it leads
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +48,16 @@ class Fence:
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
-    """Places where the plant may rest, and the place where a state comes to rest."""
+class RestRegion:
+    """Places where the plant may rest, and the place where a state comes to rest; a box."""
 
     axes: tuple[int, ...]  # index (0 north, 1 east, 2 down) of each axis that the plant has
     lower: Array  # least place to rest at of each axis (n_axes,) [m]: the terminal set fits the limits there
     upper: Array  # largest
-    rest: Array  # equilibrium for each metre of each axis (n_axes, n_x)
-    stop: Array  # place (n_axes, n_x) at which a state comes to rest by inputs that brake, as a linear map of it
+    equilibrium_map: Array  # equilibrium for each metre of each axis (n_axes, n_x)
+    stop_map: Array  # place (n_axes, n_x) at which a state comes to rest by inputs that brake, as a linear map of it
 
-    def refusal(self, position_m: Vec3) -> str:
+    def describe_refusal(self, position_m: Vec3) -> str:
         """Return why nothing may rest at a place; empty if it may."""
         for axis, lower, upper in zip(self.axes, self.lower, self.upper, strict=True):
             if not lower <= position_m[axis] <= upper:
@@ -66,25 +66,25 @@ class Room:
                 return f"{text}; {hint}" if hint else text
         return ""
 
-    def at(self, position_m: Vec3) -> Vector:
-        """The equilibrium (n_x,) at a place."""
-        return self._equilibrium(np.array([position_m[axis] for axis in self.axes]))
+    def find_equilibrium(self, position_m: Vec3) -> Vector:
+        """Find the equilibrium (n_x,) at a place."""
+        return self._make_equilibrium(np.array([position_m[axis] for axis in self.axes]))
 
-    def stopped(self, state: Vector) -> Vector:
-        """The equilibrium (n_x,) that a state is braked to, inside the limits."""
+    def find_stop(self, state: Vector) -> Vector:
+        """Find the equilibrium (n_x,) that a state is braked to, inside the limits."""
         # p = S x, within the places to rest at
-        return self._equilibrium(np.clip(self.stop @ np.array(state), self.lower, self.upper))
+        return self._make_equilibrium(np.clip(self.stop_map @ np.array(state), self.lower, self.upper))
 
-    def first(self, state: Vector, target: Vector) -> Vector | None:
-        """The equilibrium (n_x,) without the longer horizontal way; None where there are not two of them to go.
+    def find_leading_target(self, state: Vector, target: Vector) -> Vector | None:
+        """Find the equilibrium (n_x,) of the leading horizontal axis alone; None where only one axis has a way to go.
 
-        The longer one follows: so it is also flown alone at the end, where the other one has arrived.
+        The axis with the shorter way leads. The other one follows: so it is also flown alone at the end.
 
         Args:
             state: Where the motion begins (n_x,).
             target: Equilibrium to go to (n_x,).
         """
-        stops, ends = self.stop @ np.array(state), self.stop @ np.array(target)
+        stops, ends = self.stop_map @ np.array(state), self.stop_map @ np.array(target)
         begins = np.clip(stops, self.lower, self.upper)
         way, pushed = np.abs(ends - begins), np.abs(begins - stops)
         level = [i for i, axis in enumerate(self.axes) if AXES[axis] != "down"]
@@ -92,11 +92,11 @@ class Room:
             return None
         follows = min(level, key=lambda i: (float(pushed[i]) > PUSHED_M, -float(way[i])))
         ends[follows] = begins[follows]
-        return self._equilibrium(ends)
+        return self._make_equilibrium(ends)
 
-    def _equilibrium(self, places: Array) -> Vector:
+    def _make_equilibrium(self, places: Array) -> Vector:
         # x = X' p
-        return tuple((places @ self.rest).tolist())
+        return tuple((places @ self.equilibrium_map).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,8 @@ class Mission:
     limits: Array  # right sides of the state set's rows (m_x,)
     horizon: int  # H [steps]
     dt_ns: int  # δt [ns]
-    room: Room | None  # places that the operator may send the vehicle to; None if the plant cannot rest everywhere
+    # Places that the operator may send the vehicle to; None if the plant cannot rest everywhere
+    rest_region: RestRegion | None
     trajectory: Trajectory | None = None  # the motion to follow; None to fly to the waypoints
     fences: tuple[Fence, ...] = ()  # moving limits
     land: bool = False  # whether to land at the end; else the last place is held
@@ -123,7 +124,7 @@ class Lead:
 
     at_ns: int  # when it began [ns]
     target: Vector  # where it goes to (n_x,)
-    first: Vector  # equilibrium (n_x,) of its leading axis alone
+    leading_target: Vector  # equilibrium (n_x,) of its leading axis alone
 
 
 @dataclass(frozen=True)
@@ -136,11 +137,11 @@ class MissionState:
     stay: Vector | None = None  # equilibrium (n_x,) that the operator ordered instead; None on the mission
     left_ns: int | None = None  # when the mission was left for that [ns]; None on the mission
     paused_ns: int = 0  # time that a trajectory has stood still for orders [ns]; fences move on all the same
-    led: Lead | None = None  # beginning of the first motion; None before it
+    lead: Lead | None = None  # beginning of the first motion; None before it
 
 
 def advance_mission(mission: Mission, state: MissionState | None, estimate: Vector, at_ns: int) -> MissionState:
-    """The mission at a boundary; it begins where there was none.
+    """Advance the mission to a boundary; it begins where there was none.
 
     A waypoint's time runs from the arrival on, also when a gust carries the vehicle out of the circle again.
 
@@ -186,26 +187,27 @@ def lead_with_one_axis(mission: Mission, state: MissionState, estimate: Vector, 
         estimate: Estimated state at the boundary (n_x,).
         at_ns: The boundary [ns].
     """
-    if state.led is not None or mission.room is None or (mission.trajectory is not None and state.stay is None):
+    region, follows_trajectory = mission.rest_region, mission.trajectory is not None and state.stay is None
+    if state.lead is not None or region is None or follows_trajectory:
         return state
     target = find_target(mission, state, at_ns)
-    first = mission.room.first(estimate, target)
-    return state if first is None else replace(state, led=Lead(at_ns, target, first))
+    leading_target = region.find_leading_target(estimate, target)
+    return state if leading_target is None else replace(state, lead=Lead(at_ns, target, leading_target))
 
 
 def is_over(mission: Mission, state: MissionState, at_ns: int) -> bool:
     """Whether all of the mission has been flown, the last waypoint's time too."""
     if state.stay is not None:
         return False
-    motion = mission.trajectory
-    if motion is not None:  # a horizon of rest was added at its end
-        return _row(mission, state, at_ns, motion) >= len(motion.states) - 1 - mission.horizon
+    trajectory = mission.trajectory
+    if trajectory is not None:  # a horizon of rest was added at its end
+        return _find_row(mission, state, at_ns, trajectory) >= len(trajectory.states) - 1 - mission.horizon
     last = state.waypoint + 1 == len(mission.waypoints)
     return last and state.arrived_ns is not None and at_ns - state.arrived_ns >= mission.waypoints[-1].hold_ns
 
 
 def find_target(mission: Mission, state: MissionState, at_ns: int) -> Vector:
-    """State (n_x,) that the mission, or the operator, wants the vehicle to be in at a time."""
+    """Find the state (n_x,) that the mission, or the operator, wants the vehicle to be in at a time."""
     if state.stay is not None:
         return state.stay
     if mission.trajectory is None:
@@ -221,28 +223,28 @@ def find_target(mission: Mission, state: MissionState, at_ns: int) -> Vector:
 
 
 def make_question(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Preview]:
-    """Question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
-    limits = _limits(mission, at_ns - state.start_ns + mission.dead_ns)
-    led = state.led
-    if led is not None and at_ns - led.at_ns < mission.lead_ns and led.target == find_target(mission, state, at_ns):
-        return np.array(led.first), Preview(limits=limits)
+    """Make the question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
+    limits = _compute_limits(mission, at_ns - state.start_ns + mission.dead_ns)
+    lead = state.lead
+    if lead is not None and at_ns - lead.at_ns < mission.lead_ns and lead.target == find_target(mission, state, at_ns):
+        return np.array(lead.leading_target), Preview(limits=limits)
     if state.stay is not None:
         return np.array(state.stay), Preview(limits=limits)
-    motion = mission.trajectory
-    if motion is None:
+    trajectory = mission.trajectory
+    if trajectory is None:
         return mission.waypoints[state.waypoint].target, Preview(limits=limits)
-    row = _row(mission, state, at_ns, motion)
-    path = Path(states=motion.path_states[row], inputs=motion.path_inputs[row])
-    return motion.anchors[row], Preview(limits=limits, path=path)
+    row = _find_row(mission, state, at_ns, trajectory)
+    path = Path(states=trajectory.path_states[row], inputs=trajectory.path_inputs[row])
+    return trajectory.anchors[row], Preview(limits=limits, path=path)
 
 
-def _row(mission: Mission, state: MissionState, at_ns: int, motion: Trajectory) -> int:
-    """Row of the trajectory at a boundary."""
-    return min((at_ns - state.start_ns - state.paused_ns) // mission.dt_ns, len(motion.states) - 1)
+def _find_row(mission: Mission, state: MissionState, at_ns: int, trajectory: Trajectory) -> int:
+    """Find the row of the trajectory at a boundary."""
+    return min((at_ns - state.start_ns - state.paused_ns) // mission.dt_ns, len(trajectory.states) - 1)
 
 
-def _limits(mission: Mission, since_ns: int) -> Array | None:
-    """Right sides of the state rows in stages 0 … H (H+1, m_x); None where no fence is closer than they are."""
+def _compute_limits(mission: Mission, since_ns: int) -> Array | None:
+    """Compute the right sides of the state rows in stages 0 … H (H+1, m_x); None where no fence is closer."""
     if not mission.fences:
         return None
     times_ns = since_ns + mission.dt_ns * np.arange(mission.horizon + 1, dtype=np.float64)
@@ -255,9 +257,14 @@ def _limits(mission: Mission, since_ns: int) -> Array | None:
 
 
 def make_hold_mission(
-    target: Array, position_index: tuple[int, ...], limits: Array, horizon: int, dt_ns: int, room: Room | None
+    target: Array,
+    position_index: tuple[int, ...],
+    limits: Array,
+    horizon: int,
+    dt_ns: int,
+    rest_region: RestRegion | None,
 ) -> Mission:
-    """The mission to stay at one equilibrium (n_x,)."""
+    """Make the mission to stay at one equilibrium (n_x,)."""
     return Mission(
         waypoints=(Waypoint(target=target, hold_ns=0),),
         accept_m=np.inf,
@@ -265,5 +272,5 @@ def make_hold_mission(
         limits=limits,
         horizon=horizon,
         dt_ns=dt_ns,
-        room=room,
+        rest_region=rest_region,
     )

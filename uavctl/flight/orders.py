@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.fallback import Fallback, FallbackReason, request_fallback
-from uavctl.flight.mission import Mission, MissionState, Room, resume, stay_at
+from uavctl.flight.mission import Mission, MissionState, RestRegion, resume, stay_at
 from uavctl.flight.state import ControlState
 from uavctl.records import Command, Event, Order, Severity, Vec3, Vector
 
@@ -61,11 +61,11 @@ def follow_order(
     """Return the mission at a boundary, with estimate (n_x,), once an order is taken up."""
     if order is None:
         return state
-    if mission.room is None or order.order is Order.RESUME:
+    if mission.rest_region is None or order.order is Order.RESUME:
         return resume(state, at_ns)
     if order.position_m is None:
-        return stay_at(state, mission.room.stopped(estimate), at_ns)
-    return stay_at(state, mission.room.at(order.position_m), at_ns)
+        return stay_at(state, mission.rest_region.find_stop(estimate), at_ns)
+    return stay_at(state, mission.rest_region.find_equilibrium(order.position_m), at_ns)
 
 
 def describe_order(command: Command) -> str:
@@ -89,17 +89,17 @@ def _find_refusal(ordered: Ordered, command: Command, context: TickContext) -> s
         left = ordered.mission is not None and ordered.mission.stay is not None
         waits = ordered.order is not None and ordered.order.order is not Order.RESUME
         return "" if left or waits else "the mission was not left"
-    if mission.room is None:
+    if mission.rest_region is None:
         return "there are places where this plant cannot rest"
-    return "" if command.order is Order.HOLD else _find_place_refusal(command.position_m, mission.room)
+    return "" if command.order is Order.HOLD else _find_place_refusal(command.position_m, mission.rest_region)
 
 
-def _find_place_refusal(position_m: Vec3 | None, room: Room) -> str:
+def _find_place_refusal(position_m: Vec3 | None, region: RestRegion) -> str:
     if position_m is None:
         return "there is no place to go to"
     if not all(map(math.isfinite, position_m)):
         return "the place is not finite"
-    return room.refusal(position_m)
+    return region.describe_refusal(position_m)
 
 
 def _describe_position(position_m: Vec3) -> str:

@@ -1,7 +1,7 @@
 """One question to the solver, and the part of its answer that may fly.
 
 1. The solver gets the estimate at the time at which an input begins to act, the target, and what is known ahead.
-2. An answer flies if it is to this question, optimal, finite and complete. Else the old plan plays out.
+2. An answer flies if it is to this question, optimal, finite and complete. Else the old plan is flown on.
 3. The estimated bias is taken off the inputs, as it acts without us.
 """
 

@@ -9,7 +9,7 @@ from uavctl.flight.bias import Biases
 from uavctl.flight.estimator import FilterHistory, PendingInputs
 from uavctl.flight.fallback import Fallback
 from uavctl.flight.limits import ZERO
-from uavctl.flight.link_estimate import NO_COUNTS, LinkBelief
+from uavctl.flight.link_estimate import NO_COUNTS, LinkCounts
 from uavctl.flight.mission import MissionState
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import ExternalState
@@ -95,7 +95,7 @@ class FallbackGroup(msgspec.Struct, frozen=True, eq=False):
 class AlarmGroup(msgspec.Struct, frozen=True):
     """State of what is reported to people once."""
 
-    link: LinkBelief = NO_COUNTS  # counts of the link at the boundaries so far
+    link: LinkCounts = NO_COUNTS  # counts of the link at the boundaries so far
     link_alarms: tuple[str, ...] = ()  # alarms of the link that were reported and still hold, by event code
     # Use of the vehicle's inertial data, by event code; empty where none are used or we do not fly
     inertial: str = ""

@@ -42,7 +42,7 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
     sent: Array | None = None
     # Smallest and largest inputs (n_u,), biases included, where the vehicle can do less than the design assumes;
     # None: it can do all of that
-    inputs: tuple[Array, Array] | None = None
+    input_bounds: tuple[Array, Array] | None = None
 
     @property
     def nominal(self) -> bool:
@@ -56,7 +56,7 @@ NOMINAL = Preview()
 def is_finite(x: Array, target: Array, preview: Preview) -> bool:
     """Return whether all numbers of a question are finite."""
     arrays = [x, target]
-    for values in (preview.cov, preview.limits, preview.sent, *(preview.inputs or ())):
+    for values in (preview.cov, preview.limits, preview.sent, *(preview.input_bounds or ())):
         if values is not None:
             arrays.append(values)
     if preview.path is not None:

@@ -211,7 +211,7 @@ def _prediction_gain(problem: ControlProblem, error: Array, step: Array, kappa_x
     if best[0] >= 1.0:
         raise DesignError(
             "smpc.tau",
-            f"a constant delay spreads the state over {best[0]:.3g} times the room that the limits leave at the target",
+            f"a constant delay needs {best[0]:.3g} times the margin that the limits leave at the target",
             "take a shorter smpc.tau, or wider limits",
         )
     return best[1]

@@ -9,7 +9,7 @@
    disturbance a measurement, known when its position arrives. x adds e in every stage, which no feedback reduces.
    In open loop their sum has the covariance A^t P A^t' + Σ A^i E W E' A^i'.
 2. An unknown lasting acceleration (wind, drag, an error of the hover thrust) is a bias d of the input. It is a random
-   walk and a state of a larger plant, which a usual filter estimates:
+   walk and a state of a larger plant, which a Kalman filter estimates:
 
        x(k+1) = A x(k) + B (u(k) + d(k)) + E w(k) + B_d n(k),    d(k+1) = d(k) + n(k),    n ~ N(0, drift² Δt I)
 
@@ -120,7 +120,7 @@ def innovation_form(
 
     ν is that of the filter without losses. P̄ is the covariance after a position that follows `losses` losses. A
     consistent pair would be (P, ν). With P̄ larger than P in all directions, the sum is at most a few per cent of
-    standard deviation below the open-loop covariance after such a gap, and above it after the usual gap.
+    standard deviation below the open-loop covariance after such a gap, and above it after the most frequent gap.
 
     Args:
         position_std_m: Standard deviation of a position, each axis [m].

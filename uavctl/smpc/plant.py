@@ -461,12 +461,12 @@ def velocity_reference(numbers: Sequence[VelocityReferenceAxis], dt_s: float, ax
             raise DesignError(f"plant.{key}", f"{values} has a number that is not positive", "give numbers above 0")
     parts = [exponential(_make_axis_generator(axis) * dt_s)[:STATES_PER_AXIS] for axis in numbers]
     # f changes by n Δt in a step, with the deviation drift √Δt: std n = drift / √Δt
-    spread = [(axis.wind_std_mps2, axis.input_std_mps2, axis.force_drift_mps2_rts / np.sqrt(dt_s)) for axis in numbers]
+    stds = [(axis.wind_std_mps2, axis.input_std_mps2, axis.force_drift_mps2_rts / np.sqrt(dt_s)) for axis in numbers]
     return Plant(
         a=block_diag(*(part[:, :STATES_PER_AXIS] for part in parts)),
         b=block_diag(*(part[:, STATES_PER_AXIS : STATES_PER_AXIS + 1] for part in parts)),
         e=block_diag(*(part[:, [STATES_PER_AXIS + 1, STATES_PER_AXIS, STATES_PER_AXIS + 2]] for part in parts)),
-        w=np.diag(np.square(np.array(spread, dtype=np.float64)).ravel()),
+        w=np.diag(np.square(np.array(stds, dtype=np.float64)).ravel()),
         dt_s=dt_s,
         axes=axes,
         position_index=tuple(range(0, STATES_PER_AXIS * len(axes), STATES_PER_AXIS)),

@@ -19,8 +19,8 @@ Sense = NDArray[np.int32]
 
 OPEN = 1e30  # DAQP's infinity
 SOFT, EQUAL = 8, 5
-ACTIVE, BELOW = 1, 3  # a first active row, at its upper or its lower side; a soft one is relaxed at first
-KEEPS_LIMIT = 32  # added to a soft first row that is kept at first
+ACTIVE, BELOW = 1, 3  # a row of the first working set, at its upper or lower side; a soft one is relaxed at first
+KEEPS_LIMIT = 32  # added to a soft row of the first working set that is kept at first
 TOLERANCE = 1e-10  # of feasibility, primal and dual: rounding of rows of size 1
 _MAX_ITERATIONS = 2000
 # Least quadratic price of a soft row, as a share of the largest curvature: without, DAQP cycles between equalities.
@@ -75,18 +75,18 @@ class QuadraticProgram:
         return self._run()
 
     def solve_sides(
-        self, upper: Array, lower: Array, first_rows: Sense | None = None, reuse_rows: bool = False
+        self, upper: Array, lower: Array, working_set: Sense | None = None, reuse_rows: bool = False
     ) -> Array | None:
         """Return the minimiser (n,) for the last f, zero without one; None without an optimum.
 
         Args:
             upper: Upper sides (m,).
             lower: Lower sides (m,).
-            first_rows: `sense` with ACTIVE or BELOW (and KEEPS_LIMIT) added to the first active rows; None: none.
+            working_set: `sense` with ACTIVE or BELOW (and KEEPS_LIMIT) added to the rows to begin with; None: none.
             reuse_rows: Start from the active rows of the last solve, and their factors. The last bits of the result
                 depend on that solve: only for the same question.
         """
-        sense = self.sense if first_rows is None else first_rows
+        sense = self.sense if working_set is None else working_set
         if self._update(bupper=upper, blower=lower, sense=None if reuse_rows else sense) < 0:
             return None
         solution = self._run()

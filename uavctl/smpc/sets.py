@@ -20,7 +20,7 @@ from uavctl.arrays import Array
 RANK_TOLERANCE = 1e-10
 
 _SWEEPS = 20  # sweeps over rows and columns that bring both close to 1
-_USUAL_SIZES = 10.0  # natural sizes up to which a solver is accurate by itself
+_ACCURATE_SIZES = 10.0  # natural sizes up to which a solver is accurate by itself
 _ROUNDING_DEVIATION = 1e-7  # deviations below this share of the natural size are rounding
 
 
@@ -95,10 +95,10 @@ class Scale:
     variables: Array
     cost: float
 
-    def excess_over_usual(self, point: Array) -> Array:
-        """Return the part of a point (n,) beyond `_USUAL_SIZES`, in natural sizes."""
+    def compute_excess(self, point: Array) -> Array:
+        """Return the part of a point (n,) beyond `_ACCURATE_SIZES`, in natural sizes."""
         point = point / self.variables
-        return point - np.clip(point, -_USUAL_SIZES, _USUAL_SIZES)
+        return point - np.clip(point, -_ACCURATE_SIZES, _ACCURATE_SIZES)
 
 
 Index = NDArray[np.intp]

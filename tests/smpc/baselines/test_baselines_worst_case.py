@@ -108,17 +108,17 @@ def test_plans_keep_more_distance_from_the_limits_than_without_back_offs() -> No
 
 
 @pytest.mark.parametrize(("state", "control"), [(2.0, 7.5), (20.0, 0.05)])
-def test_a_delay_without_room_is_refused(state: float, control: float) -> None:
+def test_a_delay_without_a_margin_is_refused(state: float, control: float) -> None:
     tight = replace(problem("paper"), state_set=cube(4, state), input_set=cube(2, control))
-    with pytest.raises(DesignError, match="room") as refused:
+    with pytest.raises(DesignError, match="margin") as refused:
         WorstCaseDelay(tight, DELAY, 3.0, 2.0)
     assert refused.value.key == "smpc.tau"
 
 
 @pytest.mark.parametrize("position_m", [50.0, 60.0])
-def test_a_target_at_a_limit_or_beyond_leaves_no_room(position_m: float) -> None:
+def test_a_target_at_a_limit_or_beyond_leaves_no_margin(position_m: float) -> None:
     case = problem("paper")
-    with pytest.raises(DesignError, match="room"):
+    with pytest.raises(DesignError, match="margin"):
         WorstCaseDelay(replace(case, target=np.array([position_m, 0.0, 0.0, 0.0])), DELAY, 1.0, 1.0)
 
 

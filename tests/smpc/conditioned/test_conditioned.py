@@ -144,7 +144,7 @@ def test_no_short_cut_changes_the_answer(
             continue  # it has ended its rounds early
         compared += 1
         slow = plan_slowly(
-            case, solver.select_risk(target, preview).shares, x, answer.reference, preview, SLEW_MPS3[name]
+            case, solver.select_risk(target, preview).row_budgets, x, answer.reference, preview, SLEW_MPS3[name]
         )
         assert answer.inputs == pytest.approx(slow.inputs, abs=1e-6)
         assert answer.slack == pytest.approx(slow.slack, abs=1e-6)
@@ -173,7 +173,7 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
         assert (answer.inputs @ case.input_set.c.T <= case.input_set.b + 1e-12).all()
         if answer.slack == 0.0:
             kept += 1
-            assert (spent(case, answer, cov) <= solver.select_risk(target).shares + 1e-9).all()
+            assert (spent(case, answer, cov) <= solver.select_risk(target).row_budgets + 1e-9).all()
             assert not answer.relaxed
         else:
             assert sum(way.amount for way in answer.relaxed) == pytest.approx(answer.slack, abs=1e-3)
@@ -232,7 +232,7 @@ def test_in_transit_the_ages_share_equally_except_rare_ones() -> None:
     for loss in (0.1, 0.3, 0.8):
         risk = allocate_equally(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, n_binding=2)
         assert risk.age_probabilities @ risk.budgets == pytest.approx(ALLOWED - risk.older_probability)
-        counts = np.isfinite(risk.shares)
+        counts = np.isfinite(risk.row_budgets)
         assert np.ptp(risk.budgets[counts]) == 0.0
         assert (np.diff(counts.astype(int)) <= 0).all()
         left = RARE_SHARE * (ALLOWED - risk.older_probability)

@@ -11,7 +11,7 @@ from baseline_rig import problem
 from uavctl.build.controller import build_conditioned, build_controller, build_estimator, build_problem
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman, settle_covariance
-from uavctl.smpc.conditioned.backoffs import Deviations
+from uavctl.smpc.conditioned.backoffs import RowDeviations
 from uavctl.smpc.estimate import add_bias, innovation_form
 from uavctl.smpc.nominal import find_parts
 
@@ -23,7 +23,7 @@ def test_deviations_with_a_drifting_bias_match_a_simulation() -> None:
     case = replace(case, horizon=6)
     filter_plant = add_bias(case.plant, DRIFT, force=True)
     root = 0.05 * rng.normal(size=(filter_plant.n_x, filter_plant.n_x))
-    sigma = Deviations(case, find_parts(case), filter_plant).compute(root @ root.T)
+    sigma = RowDeviations(case, find_parts(case), filter_plant).compute(root @ root.T)
     # One by one, each axis in its own group of states: what another axis has to do with it is nothing to a row.
     error = rng.normal(size=(draws, filter_plant.n_x)) @ root.T
     noise = np.linalg.cholesky(filter_plant.w)
@@ -37,11 +37,11 @@ def test_deviations_with_a_drifting_bias_match_a_simulation() -> None:
 def test_without_a_bias_deviations_are_the_plant_s() -> None:
     case = problem("room-hahn-stursberg")
     cov = np.diag(np.linspace(0.01, 0.09, case.plant.n_x))
-    single = Deviations(case, find_parts(case), case.plant).compute(cov)
+    single = RowDeviations(case, find_parts(case), case.plant).compute(cov)
     filter_plant = add_bias(case.plant, 1e-9)
     known = np.zeros((filter_plant.n_x, filter_plant.n_x))
     known[: case.plant.n_x, : case.plant.n_x] = cov
-    np.testing.assert_allclose(Deviations(case, find_parts(case), filter_plant).compute(known), single, rtol=1e-9)
+    np.testing.assert_allclose(RowDeviations(case, find_parts(case), filter_plant).compute(known), single, rtol=1e-9)
 
 
 def test_a_filter_settles_at_the_riccati_solution() -> None:

@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.tasks import Cell, make_tasks
-from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, allocate_by_age, compute_reference_backoffs, quantile
+from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, allocate_by_age, compute_quantile, compute_reference_backoffs
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.estimate import innovation_form
@@ -46,7 +46,7 @@ def test_the_share_of_new_plans_with_slack_is_the_design_share(loss: float, nois
     cov = innovation_form(plant, 0.1, 0.0, 0).estimate_cov if noisy else np.zeros((4, 4))
     (d,) = distances(bernoulli(np.array([1.0 - loss])), steps, cov)[0]
     risk = allocate_by_age(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, n_binding=2)
-    backoff = quantile(risk.shares) * sigma(steps, cov)
+    backoff = compute_quantile(risk.row_budgets) * sigma(steps, cov)
     gap = np.minimum(rng.geometric(1.0 - loss, draws), steps)
     spread = propagate_covariance(plant, steps, cov) - cov
     state = np.zeros((draws, 4))
@@ -119,11 +119,11 @@ def test_both_sides_of_a_box_are_equal_and_undisturbed_rows_need_no_distance() -
     case = problem("paper")
     solver = ConditionedSolver(case, bernoulli(np.array([0.7])), ALLOWED)
     positions = np.any(case.state_set.c[:, [0, 2]] != 0.0, axis=1)
-    kept = (case.state_set.b - solver.reference_limits())[positions]
+    kept = (case.state_set.b - solver.compute_reference_limits())[positions]
     assert kept == pytest.approx(kept[0], rel=1e-9) and kept[0] > 1.0
     still = replace(case, plant=replace(case.plant, w=np.zeros((2, 2))))
     calm = ConditionedSolver(still, bernoulli(np.array([0.7])), ALLOWED)
-    assert calm.reference_limits() == pytest.approx(case.state_set.b)
+    assert calm.compute_reference_limits() == pytest.approx(case.state_set.b)
 
 
 CORNER = 'set = ["target.position_m=[49, 19, 0]"]\nruns = 300\nsteps = 50\nstart = [46, 0, 17, 0]\n'

@@ -116,19 +116,19 @@ def keeps(design: Design, i: int, theta: Array) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_no_feasible_policy_costs_less_than_the_cut(name: str) -> None:
-    """No policy within half the room of every row costs less than the frozen one."""
+    """No policy within half the distance between the limits of every row costs less than the frozen one."""
     design, rng = design_of(name), np.random.default_rng(10)
     for i in range(len(decompose(design))):
         policy, problem, covariance = frozen(name, i), problem_of(design, i), covariance_of(design, i)
         assert np.all(policy.slope >= 0.0)
-        half_room = 0.5 * (problem.upper - problem.lower)[problem.gain_rows]
-        assert np.all(policy.backoff <= half_room * (1.0 + 1e-7))
+        half_distance = 0.5 * (problem.upper - problem.lower)[problem.gain_rows]
+        assert np.all(policy.backoff <= half_distance * (1.0 + 1e-7))
         dearer = 0
         for _ in range(40):
             theta = feasible(name, i, rng)
             cost, backoffs = covariance.cost(theta), covariance.backoffs(theta)
             assert policy.level - policy.slope @ backoffs <= cost * (1.0 + 1e-7)
-            if np.all(backoffs <= half_room):
+            if np.all(backoffs <= half_distance):
                 assert cost >= policy.cost * (1.0 - 1e-7)
             # A thousand times what the comparison forgives.
             dearer += bool(cost > 1.0001 * policy.cost)

@@ -82,7 +82,7 @@ def test_a_target_that_only_more_expensive_inputs_hold_is_refused() -> None:
     kappa_x, kappa_u = terminal_factors(case)
     x = case.plant.equilibrium(PLACE_M)
     limits = (case.state_set, case.input_set, x, kappa_x, kappa_u)
-    with pytest.raises(DesignError, match="leaves no room"):
+    with pytest.raises(DesignError, match="leaves no margin"):
         synthesize(case.plant, case.tau, case.q_x, case.q_u, *limits)
     # From a design for another target: the plan ends as near as its rest input allows.
     assert at_place(requested(FITS_SMALLEST, (0.0, 0.0, 0.0))).offset > 0.1

@@ -147,7 +147,7 @@ def test_a_target_far_away_is_approached() -> None:
 def test_a_hard_answer_is_the_same_for_any_origin(monkeypatch: pytest.MonkeyPatch) -> None:
     """The origin of large numbers is not part of the problem."""
     made = case("coupled 0")
-    monkeypatch.setattr("uavctl.smpc.sets._USUAL_SIZES", 0.0)
+    monkeypatch.setattr("uavctl.smpc.sets._ACCURATE_SIZES", 0.0)
     shifted = ConicSolver(made.design).solve(0, made.x, made.design.target)
     assert kept(shifted)
     assert shifted.cost == pytest.approx(made.answer.cost, rel=1e-7)

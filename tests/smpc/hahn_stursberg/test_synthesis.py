@@ -300,7 +300,9 @@ def test_too_long_a_delay_for_an_unstable_plant_is_refused(growth: float) -> Non
 
 def test_limits_that_no_gain_fits_are_refused_with_figures() -> None:
     plant = one_axis(paper_plant())
-    with pytest.raises(DesignError, match=r"takes 4\.\d+ of the room to a state limit \(Assumption 4\.3\)") as refused:
+    with pytest.raises(
+        DesignError, match=r"takes 4\.\d+ of the margin to a state limit \(Assumption 4\.3\)"
+    ) as refused:
         minimum(plant, 4, np.diag([10.0, 0.1]), np.array([[0.1]]), x=[1.0, INF])
     assert refused.value.key == "smpc.k_tau"
 

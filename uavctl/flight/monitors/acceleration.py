@@ -3,7 +3,7 @@
 1. The observer (`uavctl.flight.monitors.observer`) gives the unexplained acceleration at each position.
 2. Drag explains the part that points against the velocity.
 3. Where inertial data show the same acceleration, it is wind or a hit: a push, and positions are right.
-4. What is left is compared with its bound: for a while, or at once if it is plainly beyond. Then: end the plans.
+4. What is left is compared with its bound: for 0.1 s, or at once if it is 1.5 times the bound. Then: end the plans.
 5. Three clipped innovations of the last five: positions scatter. Then: end the plans.
 
 A frame that is turned, mirrored or in another unit gives the acceleration sent a wrong direction or size. A marker that
@@ -31,15 +31,17 @@ from uavctl.flight.monitors.observer import POSITION_STD_M, Observer, measure_si
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import VehicleMotion
 
-SCATTERED, OF = 3, 5  # clipped innovations among the last ones that are no chance
+CLIPPED_LIMIT, CLIPPED_OF = 3, 5  # so many clipped innovations of the last ones are no chance
 PERSISTS_NS = 100_000_000  # time for which it has to last, over two positions at least
-PLAIN = 1.5  # this many times the bound is beyond it at once
-KNOWN = 1.5  # it counts from so many of its standard deviations on,
-KNOWN_NOISY = 4.0  # and from so many where positions are noisier than usual: chance alone makes two of them
-HINT = 0.4  # of the bound: a hint for the comparison of velocities
-QUIET = 0.5  # of the bound: below it, positions are clean
+IMMEDIATE_RATIO = 1.5  # of the bound: from there on one position is enough
+MIN_SIGMA = 1.5  # it counts from so many of its standard deviations on,
+MIN_SIGMA_NOISY = 4.0  # and from so many where positions are noisier than `USUAL_STD_M`: chance alone makes two of them
+HINT_RATIO = 0.4  # of the bound: above it, a difference of velocities counts at once
+CLEAN_RATIO = 0.5  # of the bound: up to it, a position is clean
+# Of the bound: a push that inertial data show explains nothing up to it, and a strong push ends at it.
+PUSH_RATIO = 0.5
 GRAVITY_MPS2 = 9.81
-LEAST_UP = 0.1  # vertical part of the thrust below which the vehicle lies on its side
+MIN_UP = 0.1  # vertical part of the thrust below which the vehicle lies on its side
 _COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
@@ -54,13 +56,13 @@ class AccelerationState(msgspec.Struct, frozen=True):
 
     @property
     def is_hinted(self) -> bool:
-        """Whether something may be amiss."""
-        return self.ratio > HINT
+        """Whether something may be wrong."""
+        return self.ratio > HINT_RATIO
 
     @property
-    def is_quiet(self) -> bool:
+    def is_clean(self) -> bool:
         """Whether the last position is clean."""
-        return self.ratio <= QUIET and self.clipped[-1:] != (True,)
+        return self.ratio <= CLEAN_RATIO and self.clipped[-1:] != (True,)
 
 
 def update(state: AccelerationState, observation: PositionObservation) -> tuple[AccelerationState, Verdict]:
@@ -73,15 +75,15 @@ def update(state: AccelerationState, observation: PositionObservation) -> tuple[
     is_pushed, beside_mps2 = _explain_push(state, observation.motion, beside_sent_mps2, bound_mps2)
     ratio = beside_mps2 / bound_mps2
     # |d| > 1.5 √P_dd
-    sigma = KNOWN_NOISY if POSITION_STD_M < observation.std_m <= LARGEST_STD_M else KNOWN
-    known = beside_mps2 > sigma * math.sqrt(observer.cov[2, 2])
-    over_ns = (state.over_ns or observation.at_ns) if ratio > 1.0 and known else None
-    clipped = (*state.clipped, observation.is_clipped)[-OF:]
+    sigma = MIN_SIGMA_NOISY if POSITION_STD_M < observation.std_m <= LARGEST_STD_M else MIN_SIGMA
+    is_significant = beside_mps2 > sigma * math.sqrt(observer.cov[2, 2])
+    over_ns = (state.over_ns or observation.at_ns) if ratio > 1.0 and is_significant else None
+    clipped = (*state.clipped, observation.is_clipped)[-CLIPPED_OF:]
     state = AccelerationState(beside_sent_mps2, ratio, clipped, is_pushed, over_ns)
-    if over_ns is not None and (ratio >= PLAIN or observation.at_ns - over_ns >= PERSISTS_NS):
+    if over_ns is not None and (ratio >= IMMEDIATE_RATIO or observation.at_ns - over_ns >= PERSISTS_NS):
         return state, end_plans(EventCode.RESPONSE, _describe_response(unexplained, observation))
-    if sum(clipped) >= SCATTERED:
-        return state, end_plans(EventCode.SCATTER, "positions leap about by more than the vehicle can move")
+    if sum(clipped) >= CLIPPED_LIMIT:
+        return state, end_plans(EventCode.SCATTER, "positions scatter by more than the vehicle can move")
     return state, NO_VERDICT
 
 
@@ -98,10 +100,10 @@ def _explain_push(
     observer = motion.observer
     if observer is None or observer.inertial is None:
         return state.is_pushed, beside_sent_mps2
-    if not measure_size_mps2(motion.push_mps2) > QUIET * bound_mps2:
+    if not measure_size_mps2(motion.push_mps2) > PUSH_RATIO * bound_mps2:
         return False, beside_sent_mps2
     beside_mps2 = min(beside_sent_mps2, measure_size_mps2(remove_drag(observer.inertial)))
-    return beside_sent_mps2 > (QUIET if state.is_pushed else 1.0) * bound_mps2 >= beside_mps2, beside_mps2
+    return beside_sent_mps2 > (PUSH_RATIO if state.is_pushed else 1.0) * bound_mps2 >= beside_mps2, beside_mps2
 
 
 def _describe_response(unexplained: Array, observation: PositionObservation) -> str:
@@ -157,7 +159,7 @@ def compute_lean_mps2(motion: VehicleMotion, at_ns: int) -> tuple[float, float] 
         return None
     roll, pitch, yaw = motion.attitude_rad
     up = math.cos(roll) * math.cos(pitch)
-    if up < LEAST_UP:
+    if up < MIN_UP:
         return None
     # a = g R_z(ψ) (-sin θ cos φ, sin φ) / (cos φ cos θ)
     forward, right = -math.sin(pitch) * math.cos(roll) / up, math.sin(roll) / up

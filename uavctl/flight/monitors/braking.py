@@ -18,8 +18,9 @@ from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 
-SHOWS_NS = 1_000_000_000  # time after which braking must have shown
-BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of the first one, and this more
+EFFECT_NS = 1_000_000_000  # time after which braking must have reduced the speed
+# It must be below this part of the first speed, plus this.
+MAX_SPEED_PART, MAX_SPEED_MPS = 0.8, 0.3
 
 
 class BrakingState(msgspec.Struct, frozen=True):
@@ -55,7 +56,7 @@ def update(
         return BrakingState((tick.at_ns, speed_mps), state.resumed_ns), NO_VERDICT
     since_ns, began_mps = state.began
     # v > 0.8 v_0 + 0.3 m/s
-    if tick.at_ns - since_ns < SHOWS_NS or speed_mps <= BRAKED * began_mps + BRAKED_MPS:
+    if tick.at_ns - since_ns < EFFECT_NS or speed_mps <= MAX_SPEED_PART * began_mps + MAX_SPEED_MPS:
         return state, NO_VERDICT
     text = f"braking does not brake: {began_mps:.1f} m/s then, {speed_mps:.1f} m/s now"
     return state, end_plans(EventCode.BRAKING, text)

@@ -3,7 +3,8 @@
 1. The shared record of motion takes the tick (`uavctl.flight.monitors.motion`).
 2. Each believed position goes through the monitors of acceleration and velocity.
 3. Then the monitors of the tick are asked: an open contradiction, outside the room, braking.
-4. The first verdict counts. A position is clean if all was quiet at it: what came later is dropped when plans end.
+4. The first verdict counts. A position at which no monitor finds anything is clean. When plans end, later positions are
+   dropped.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class MonitorState(msgspec.Struct, frozen=True, eq=False):
     braking: BrakingState = BrakingState()
     velocity_change: VelocityChangeState = VelocityChangeState()
     response: ResponseState = ResponseState()
-    consistent_ns: int | None = None  # capture time of the last position at which all was quiet [ns]; None before any
+    consistent_ns: int | None = None  # capture time of the last clean position [ns]; None before any
     agreed: bool = False  # whether positions agreed with the vehicle's inertial data before the flight
 
     @property
@@ -95,7 +96,7 @@ def _update_with_position(
     if acceleration_state.is_hinted:
         position = replace(position, is_hinted=True)
     velocity_state, contradiction = velocity.update(state.velocity, position)
-    is_clean = acceleration_state.is_quiet and velocity_state.agrees(parameters)
+    is_clean = acceleration_state.is_clean and velocity_state.agrees(parameters)
     state = replace(
         state,
         motion=motion,

@@ -1,6 +1,6 @@
-"""Monitor: frozen position sources. A value comes again with a new stamp: is its source frozen, or the vehicle at rest?
+"""Monitor: frozen position sources. A value repeats with a new stamp: is its source frozen, or the vehicle at rest?
 
-1. A value that comes again to the last bit proves nothing by itself: a vehicle on the ground, cameras that round, a
+1. A value that repeats to the last bit proves nothing by itself: a vehicle on the ground, cameras that round, a
    simulation without noise. The resolution of a source is the smallest change that it has shown.
 2. A source is frozen (`is_frozen`) where the vehicle must have moved: since the value first came, inputs alone have
    moved the prediction by more than σ √(P + R) + margin + resolution. σ is `estimator.gate_sigma`, the margin is
@@ -9,7 +9,7 @@
    `_MOVED_RESOLUTIONS`, and noise has moved the source's values so far. So is one whose noisy axis repeats
    `_AXIS_REPEATS` times. These numbers are constants. Then: distrust its positions since the value came.
 4. Before that is known, a repeated value is suspect (`is_suspect`) where it would do harm: where noise has moved the
-   source's values so far (a usual camera: at the first repeat), or where inputs alone have moved the prediction by more
+   source's values so far (most cameras: at the first repeat), or where inputs alone have moved the prediction by more
    than ½ σ √R + resolution. Then: distrust this position, and at the first `_REPEATS` repeats all positions since the
    value came; but not of a source that regularly sends each value twice.
 5. A link loses samples. The first sample of a value may itself be a repeat, with a stamp that is too new. So this
@@ -18,6 +18,7 @@
 7. Cameras that round repeat their value while a vehicle is at rest by its own velocity: they are believed, as on the
    ground. Cameras with noise to the last digit are not, as the vehicle's velocity may be made of their positions
    (`at_rest_mps` is 0 then).
+8. A repeat that the gate for outliers refuses is frozen, too, and no jump (`uavctl.flight.measure`).
 
 False alarms (docs/soak.md): no position of 200 missions was refused.
 """
@@ -99,7 +100,7 @@ class SourceTrack(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def has_just_begun_to_repeat(self) -> bool:
-        """Whether the value has come again a few times, by a source that does not repeat regularly."""
+        """Whether the value has repeated a few times, by a source that does not repeat regularly."""
         return 0 < self.repeats <= _REPEATS and not self.repeats_regularly
 
     @property
@@ -123,7 +124,7 @@ class SourceTrack(msgspec.Struct, frozen=True, eq=False):
         return min(frozen_axes_ns, default=None)
 
     def may_rest(self, last_motion_ns: LastMotionNs) -> bool:
-        """Whether a rounded value comes again because the vehicle has rested all the time, by its own velocity."""
+        """Whether a rounded value repeats because the vehicle has rested all the time, by its own velocity."""
         is_rounded = self.resolution_m >= _ROUNDED_M
         return (
             is_rounded and max(last_motion_ns) < self.first_ns and not (self.is_known_suspect or self.is_known_frozen)
@@ -243,7 +244,7 @@ def _find_spacing_ns(track: SourceTrack, at_ns: int) -> int:
 def is_frozen(
     track: SourceTrack, kalman: Kalman, sample: PositionSample, parameters: GateParameters, last_motion_ns: LastMotionNs
 ) -> bool:
-    """Whether a source is frozen, as `record_sample` left it with its newest sample."""
+    """Whether a source is frozen, as `track_sample` left it with its newest sample."""
     if track.find_frozen_axis_ns(last_motion_ns) is not None:
         return True
     belief = track.open_loop_belief
@@ -260,14 +261,13 @@ def is_frozen(
     )
     if (far_m > bound_m).any() and not track.repeats_regularly:
         return True
-    spread_m = float(np.sqrt(variance.max()))
-    return (
-        _is_noisy(track, _NOISY) and spread_m >= _MOVED_RESOLUTIONS * track.resolution_m and track.repeats >= _REPEATS
-    )
+    prediction_std_m = float(np.sqrt(variance.max()))
+    must_have_moved = prediction_std_m >= _MOVED_RESOLUTIONS * track.resolution_m
+    return must_have_moved and _is_noisy(track, _NOISY) and track.repeats >= _REPEATS
 
 
 def is_suspect(track: SourceTrack, kalman: Kalman, sample: PositionSample, parameters: GateParameters) -> bool:
-    """Whether a value that came again is not to be believed, though its source is not known to be frozen."""
+    """Whether a repeated value is not to be believed, though its source is not known to be frozen."""
     belief = track.open_loop_belief
     if belief is None or track.is_known_suspect:
         return track.is_known_suspect

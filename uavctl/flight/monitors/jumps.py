@@ -80,12 +80,12 @@ def suspend(track: JumpTrack, at_ns: int) -> JumpTrack:
     return JumpTrack(seen_ns=track.seen_ns, settled_ns=max(track.settled_ns, at_ns + 1))
 
 
-def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s: float) -> tuple[JumpTrack, Outcome]:
+def update(track: JumpTrack, offset_m: Vec3, std_m: Array, at_ns: int, age_s: float) -> tuple[JumpTrack, Outcome]:
     """Take a position inside the gate, which was noted; return too what becomes of it.
 
     Args:
         offset_m: Position less the shift and the prediction.
-        spread_m: Standard deviation of that offset, each axis of the plant.
+        std_m: Standard deviation of that offset, each axis of the plant.
         age_s: Time since the newest position that counted.
     """
     jump_m = track.jump_m
@@ -93,16 +93,16 @@ def update(track: JumpTrack, offset_m: Vec3, spread_m: Array, at_ns: int, age_s:
         return replace(track, offset_m=offset_m, jump_m=None), Outcome.COUNTS
     if jump_m is not None and math.dist(offset_m, jump_m) <= SAME_PART * math.hypot(*offset_m):
         return _confirm_jump(track, offset_m, jump_m, at_ns)
-    if _is_jump(track, offset_m, spread_m, age_s):
+    if _is_jump(track, offset_m, std_m, age_s):
         return replace(track, jump_m=offset_m), Outcome.REFUSED
     return replace(track, offset_m=offset_m, jump_m=None), Outcome.COUNTS
 
 
-def _is_jump(track: JumpTrack, offset_m: Vec3, spread_m: Array, age_s: float) -> bool:
+def _is_jump(track: JumpTrack, offset_m: Vec3, std_m: Array, age_s: float) -> bool:
     """Whether a position is far from its prediction, and the last one that counted was not on the way there."""
     # e = min(v t + ½ a t², e_max)
     error_m = min(ERROR_MPS * age_s + 0.5 * ERROR_MPS2 * age_s * age_s, LARGEST_ERROR_M)
-    bound_m = max(LEAST_JUMP_M, JUMP_SIGMA * max(spread_m.tolist()), error_m)
+    bound_m = max(LEAST_JUMP_M, JUMP_SIGMA * max(std_m.tolist()), error_m)
     change = [now - before for now, before in zip(offset_m, track.offset_m, strict=True)]
     if not min(math.hypot(*offset_m), math.hypot(*change)) > bound_m:
         return False

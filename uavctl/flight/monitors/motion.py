@@ -19,7 +19,7 @@ from uavctl.arrays import Array
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.observation import MOTION_NS, EnvelopeParameters, Observation, read_vehicle_velocity
 from uavctl.flight.monitors.observer import (
-    LEAST_LAG_S,
+    MIN_LAG_S,
     POSITION_STD_M,
     InertialPath,
     Observer,
@@ -73,7 +73,7 @@ class PositionObservation(msgspec.Struct, frozen=True, eq=False):
     tick: Observation
     parameters: EnvelopeParameters
     std_m: float = 0.0  # its standard deviation
-    is_hinted: bool = False  # whether the acceleration already hints at something amiss
+    is_hinted: bool = False  # whether the acceleration already hints at a fault
 
 
 def update_motion(motion: Motion, observation: Observation, parameters: EnvelopeParameters) -> Motion:
@@ -125,7 +125,7 @@ def _follow_model(motion: Motion, observation: Observation, parameters: Envelope
     s, velocities, accels = (observation.at_ns - motion.tick_ns) * 1e-9, [], []
     rows = zip(motion.model_mps, motion.model_mps2, observation.sent_mps2, parameters.lag_s, strict=True)
     for velocity, accel, setpoint, lag_s in rows:
-        lag_s = max(lag_s, LEAST_LAG_S)
+        lag_s = max(lag_s, MIN_LAG_S)
         remaining = math.exp(-s / lag_s)
         # v = v + s u + (a_0 - u) τ (1 - e^(-s/τ)); a = u + (a_0 - u) e^(-s/τ)
         velocities.append(velocity + s * setpoint + (accel - setpoint) * lag_s * (1.0 - remaining))

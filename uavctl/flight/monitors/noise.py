@@ -2,7 +2,7 @@
 
 1. Each position is compared with the line between its neighbours in time. The median of such residuals is the noise:
    neither a jump nor a burst of outliers changes a median, and no acceleration bends a path by so much.
-2. A position counts with that standard deviation where it is larger than what is usual.
+2. A position counts with that standard deviation where it is larger than `USUAL_STD_M`.
 
 Frames that are wrong make smooth errors, which do not change the noise.
 """
@@ -17,8 +17,8 @@ import msgspec
 
 from uavctl.records import PositionSample, Vec3
 
-USUAL_STD_M = 0.012  # up to here noise is usual: bounds of other monitors include it
-LARGEST_STD_M = 0.1  # larger noise is none of a camera system that works
+USUAL_STD_M = 0.012  # largest noise that the bounds of other monitors include
+LARGEST_STD_M = 0.1  # a camera system that works has no larger noise
 _RESIDUALS, _LEAST_RESIDUALS = 15, 3  # a second or so at 20 Hz
 # Neighbours whose distances in time have a larger product are too far apart: 4 m/s² bend a path by 0.02 m within it.
 _LARGEST_S2 = 0.01
@@ -30,7 +30,9 @@ class NoiseTrack(msgspec.Struct, frozen=True):
 
     last: tuple[tuple[int, Vec3], ...] = ()  # up to two: capture time [ns], position [m]
     residuals_m: tuple[float, ...] = ()  # newest last, scaled to the noise of a single position
-    std_m: float = 0.0  # standard deviation of a position, each axis [m]; 0 where it is not known or usual
+    std_m: float = (
+        0.0  # standard deviation of a position, each axis [m]; 0 where it is not known, or not above `USUAL_STD_M`
+    )
 
     @property
     def is_known(self) -> bool:
@@ -56,7 +58,7 @@ def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
 
 
 def _estimate_std_m(residuals_m: Sequence[float]) -> float:
-    """Estimate the standard deviation of a position [m]; 0 where too few residuals show it, or it is usual."""
+    """Estimate the standard deviation of a position [m]; 0 where too few residuals show it, or it is small."""
     if len(residuals_m) < _LEAST_RESIDUALS:
         return 0.0
     std_m = median(residuals_m) / _MEDIAN_3D

@@ -27,9 +27,9 @@ from uavctl.flight.limits import ZERO
 from uavctl.records import Vec3
 
 DRAG_1PS = 1.2  # most drag that is taken for drag: PX4's simulated vehicles have 1.0
-CLIP = 6.0  # an innovation counts up to so many standard deviations: one reflection is no proof
+CLIP_SIGMA = 6.0  # an innovation counts up to so many standard deviations: one reflection is no proof
 POSITION_STD_M = 0.02  # least standard deviation of a position: the gate and rounding may leave so much
-LEAST_LAG_S = 1e-3  # for a plant without a lag
+MIN_LAG_S = 1e-3  # for a plant without a lag
 _BEGIN = attrgetter("at_ns")
 _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
 _IDENTITY = np.eye(3)
@@ -127,7 +127,7 @@ def _follow_setpoints(
     observer: Observer, sent: tuple[tuple[int, Vec3], ...], at_ns: int, lag_s: Vec3
 ) -> tuple[Array, Array]:
     """Compute the mean (3, 3) and the acceleration (3,) at a time, by the setpoints behind the vehicle's lag."""
-    lags_s = [max(lag, LEAST_LAG_S) for lag in lag_s]
+    lags_s = [max(lag, MIN_LAG_S) for lag in lag_s]
     position, velocity, unexplained = observer.mean.tolist()
     accel: list[float] = observer.accel_mps2.tolist()
     first = bisect_right(sent, observer.at_ns, key=_TIME)
@@ -165,7 +165,7 @@ def correct_observer(observer: Observer, position: Array, std_m: float) -> tuple
     noise = max(std_m, POSITION_STD_M) ** 2
     # S = P_pp + R; K = P H' / S
     variance = float(observer.cov[0, 0]) + noise
-    bound = CLIP * math.sqrt(variance)
+    bound = CLIP_SIGMA * math.sqrt(variance)
     gain = observer.cov[:, :1] / variance  # (3, 1)
     mean, is_clipped = _correct_mean(observer.mean, position, gain, bound)
     # P = (I - K H) P (I - K H)' + R K K'

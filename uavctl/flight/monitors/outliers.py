@@ -6,7 +6,8 @@
 2. A sample outside the gate is refused: distrust this position.
 3. That growth would let a source that jumped in again. So as long as refused samples agree about their offset, a sample
    nearer to them than to the prediction is refused too.
-4. Two of them, 0.1 s apart: brake (`uavctl.flight.supervise`). Three, over `jump_ns`: the source has moved, release.
+4. Two of them, 0.1 s apart: brake (`uavctl.flight.supervise`). Three, over `jump_ns`: the source has moved. Then: end
+   the plans.
 
 False alarms (docs/soak.md): no position of 200 missions was refused.
 """
@@ -43,12 +44,12 @@ class GateParameters:
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Distances that inputs can make; constant."""
+    """Largest changes that inputs can make, by the time since a sample; constant."""
 
     parameters: GateParameters  # its size in standard deviations, and the time of a jump
-    tick_ns: int  # time between the rows of `far` [ns]
+    tick_ns: int  # time between the rows of `max_change` [ns]
     # (n, n_values): largest change of positions, then velocities, that inputs can make in so many ticks
-    far: Array
+    max_change: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +79,12 @@ def make_reach(
     bounds = np.array([limits.accel_mps2[AXES.index(axis)] for axis in plant.axes])
     largest = np.abs(np.linalg.pinv(plant.accel_map)) @ bounds
     shown = list(plant.position_index + plant.velocity_index)
-    far, effect = [np.zeros(len(shown))], b
+    max_change, effect = [np.zeros(len(shown))], b
     # Δy(k) = Σ |C A^i B| 2 u_max: from one limit to the other
     for _ in range(_HORIZONS * ticks_per_horizon):
-        far.append(far[-1] + np.abs(effect[shown]) @ (2.0 * largest))
+        max_change.append(max_change[-1] + np.abs(effect[shown]) @ (2.0 * largest))
         effect = a @ effect
-    return Reach(parameters=parameters, tick_ns=tick_ns, far=np.array(far))
+    return Reach(parameters=parameters, tick_ns=tick_ns, max_change=np.array(max_change))
 
 
 class OutlierObservation(msgspec.Struct, frozen=True, eq=False):
@@ -105,29 +106,30 @@ def compute_gate(reach: Reach, kalman: Kalman, belief: Belief, variances: Array,
     values = slice(len(variances))
     age_s = (belief.at_ns - belief.captured_ns) * 1e-9
     # w = σ √(H P H' + R) + Δy(age) + (margin + e age, e)
-    spread: Array = np.sqrt(belief.cov.diagonal()[kalman.measured_index[values]] + variances)
-    doubted = np.concatenate((reach.parameters.margin_m + velocity_error_mps * age_s, velocity_error_mps))
-    return reach.parameters.sigma * spread + (_reach_since(reach, belief) + doubted)[values]
+    offset_std: Array = np.sqrt(belief.cov.diagonal()[kalman.measured_index[values]] + variances)
+    beside_inputs = np.concatenate((reach.parameters.margin_m + velocity_error_mps * age_s, velocity_error_mps))
+    return reach.parameters.sigma * offset_std + (_find_max_change(reach, belief) + beside_inputs)[values]
 
 
 def bound_velocity_error(reach: Reach, belief: Belief, offset_m: Array) -> Array:
     """Bound the error of the velocity (n_axes,) [m/s] after a sample `offset_m` away from its prediction counted.
 
     A filter that knows its inputs takes the offset for a velocity that disturbances made. Inputs that it does not know
-    may have made the position and none of that velocity, as far as they can.
+    may have made the position and none of that velocity, up to `Reach.max_change`.
     """
     age_ns = belief.at_ns - belief.captured_ns
     if not age_ns:
         return np.zeros(len(offset_m))
     # e = min(2 |ν| / age, Δv(age))
-    error: Array = np.minimum(2.0 * np.abs(offset_m) / (age_ns * 1e-9), _reach_since(reach, belief)[len(offset_m) :])
+    max_velocity_change = _find_max_change(reach, belief)[len(offset_m) :]
+    error: Array = np.minimum(2.0 * np.abs(offset_m) / (age_ns * 1e-9), max_velocity_change)
     return error
 
 
-def _reach_since(reach: Reach, belief: Belief) -> Array:
+def _find_max_change(reach: Reach, belief: Belief) -> Array:
     """Return the change of positions, then velocities, that inputs can have made since a belief's newest sample."""
     ticks = -(-(belief.at_ns - belief.captured_ns) // reach.tick_ns)
-    return reach.far[ticks] if ticks < len(reach.far) else np.full(reach.far.shape[1], np.inf)
+    return reach.max_change[ticks] if ticks < len(reach.max_change) else np.full(reach.max_change.shape[1], np.inf)
 
 
 _DISTRUSTED = Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_JUMP)

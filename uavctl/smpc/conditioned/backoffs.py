@@ -6,7 +6,7 @@ The margin of a row is b - c'x: what its limit leaves. The back-off β is the ma
    Σ_t π_t ε̄_t = 1 - δ_x - P(a > H).
 2. `reallocate_to_rows` gives the budget of an age to the rows of a plan (iterative risk allocation): rows that do not
    bind give risk to rows that bind. Row i of stage t keeps the back-off Φ⁻¹(1 - ε_ti) σ_ti.
-3. `Deviations` are the σ_ti of a plan in open loop:
+3. `RowDeviations` are the σ_ti of a plan in open loop:
 
        σ² = c'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c,   t = 1 … H
 
@@ -54,8 +54,8 @@ class AgeRisk:
     budgets: Array
 
     @property
-    def shares(self) -> Array:
-        """Risk that plans allocate to their rows (H,); infinite where ε̄_t is 1, because the rows are free then."""
+    def row_budgets(self) -> Array:
+        """Budgets (H,) that plans allocate to their rows; infinite where ε̄_t is 1, because the rows are free then."""
         return np.where(self.budgets >= 1.0, np.inf, self.budgets)
 
 
@@ -77,25 +77,26 @@ def allocate_by_age(
         DesignError: Information is older than the horizon more often than allowed.
     """
     steps = len(deviations)
-    weights, older_probability, remaining = _weigh_ages(link, steps, allowed)
+    weights, older_probability, remaining = _compute_age_probabilities(link, steps, allowed)
     max_budget = min(1.0, n_binding * MAX_RISK)
     if not deviations.all():
         return AgeRisk(weights, older_probability, np.full(steps, min(remaining / weights.sum(), max_budget)))
     # Stationary: π_t φ(κ_t) / σ_t = λ π_t^h, so κ_t² = 2 log(π_t^(1-h) / (λ σ_t)) where that is positive.
     scale = np.log(np.maximum(weights, np.finfo(float).tiny)) * (1.0 - exponent) - np.log(deviations)
 
-    def budgets(level: float) -> Array:
+    def compute_budgets(level: float) -> Array:
         # ε̄_t = n Φ(-κ_t), not larger for a younger age: a link better than its model uses no more risk.
         values = np.minimum(n_binding * ndtr(-np.sqrt(2.0 * np.maximum(level + scale, 0.0))), max_budget)
         return np.ascontiguousarray(np.minimum.accumulate(values[::-1])[::-1])
 
-    def excess(level: float) -> float:
-        return float(weights @ budgets(level)) - remaining
+    def find_excess(level: float) -> float:
+        return float(weights @ compute_budgets(level)) - remaining
 
     from scipy.optimize import brentq  # slow to import, needed for a design only
 
     low, high = -float(scale.max()), -float(scale[weights > 0.0].min()) + 1000.0
-    return AgeRisk(weights, older_probability, budgets(float(brentq(excess, low, high)) if excess(low) > 0.0 else low))
+    level = float(brentq(find_excess, low, high)) if find_excess(low) > 0.0 else low
+    return AgeRisk(weights, older_probability, compute_budgets(level))
 
 
 def allocate_equally(link: AgeModel, steps: int, allowed: float, n_binding: int = 1) -> AgeRisk:
@@ -112,7 +113,7 @@ def allocate_equally(link: AgeModel, steps: int, allowed: float, n_binding: int 
         DesignError: Information is older than the horizon more often than allowed.
     """
     # ε̄_t = 1 for rare ages, else (1 - δ_x - P(a > H) - Σ_rare π_t) / Σ_other π_t
-    weights, older_probability, remaining = _weigh_ages(link, steps, allowed)
+    weights, older_probability, remaining = _compute_age_probabilities(link, steps, allowed)
     older = np.cumsum(weights[::-1])[::-1]
     rare = older <= RARE_SHARE * remaining
     max_budget = min(1.0, n_binding * MAX_RISK)
@@ -120,7 +121,7 @@ def allocate_equally(link: AgeModel, steps: int, allowed: float, n_binding: int 
     return AgeRisk(weights, older_probability, np.where(rare, 1.0, equal))
 
 
-def _weigh_ages(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, float]:
+def _compute_age_probabilities(link: AgeModel, steps: int, allowed: float) -> tuple[Array, float, float]:
     """Return π_t (H,), P(a > H), and the remainder of the allowed risk."""
     # π_t = P(a >= t-1) - P(a >= t), as shares of time in the long run
     older = np.array([link.outage(age) for age in range(steps + 1)])
@@ -144,12 +145,12 @@ DISTANT_SHARE = 0.1  # share of a budget for rows that the regulator's plan is n
 _BINDING_TOLERANCE = 1e-9  # distance from its back-off at which a row binds, in standard deviations
 
 
-def quantile(risk: Array) -> Array:
+def compute_quantile(risk: Array) -> Array:
     """Return κ = Φ⁻¹(1 - ε) of risks ε; 0 above MAX_RISK."""
     return np.asarray(-ndtri(np.minimum(risk, MAX_RISK)))
 
 
-def violation_risk(margin: Array, sigma: Array) -> Array:
+def compute_violation_risk(margin: Array, sigma: Array) -> Array:
     """Return the probability Φ(-margin / σ) that a row is violated whose mean keeps `margin`; all of the same shape."""
     if np.count_nonzero(sigma) == sigma.size:
         return np.asarray(ndtr(margin / -sigma))
@@ -190,12 +191,12 @@ def reallocate_to_rows(
     np.minimum(kept, np.maximum(backoff, max_deviations * sigma), out=kept)
     if budgets[-1] == math.inf:
         kept *= np.isfinite(budgets)[:, None]
-    risk = violation_risk(kept, sigma)
+    risk = compute_violation_risk(kept, sigma)
     np.putmask(risk, binds, 0.0)
     count = binds.dot(_make_ones(binds.shape[1]))
     remaining = budgets - np.add.reduce(risk, axis=1)
     everywhere = np.count_nonzero(count) == count.size
-    share = quantile(remaining / (count if everywhere else np.maximum(count, 1.0)))
+    share = compute_quantile(remaining / (count if everywhere else np.maximum(count, 1.0)))
     np.multiply(share[:, None], sigma, out=kept, where=binds)
     return kept if everywhere else np.where(count[:, None] > 0.0, kept, backoff)
 
@@ -209,7 +210,7 @@ def _make_ones(count: int) -> Array:
 Index = NDArray[np.intp]
 
 
-class Deviations:
+class RowDeviations:
     """Standard deviations σ_ti of the state rows under a plan in open loop.
 
     Where the filter has more states than the plant, biases of its inputs (`add_bias`), A, E, W and P include them. σ²
@@ -325,36 +326,39 @@ class _RestingRows:
     gaps: Array  # q_t (L,)
     sigma: Array  # deviations of the rows (H, m) in the stages of a plan
     reach: Array  # g_s, distance from the limit that inputs can gain (H, m)
-    jump: Array  # deviations of c'A^s e (L, H, m), the effect of a new position on the rows
+    correction: Array  # deviations of c'A^s e (L, H, m), the effect of a new position on the rows
 
     def find_distance(self, row: int, n_rows: int, allowed: float) -> float:
         """Return the distance to keep from a row that shares the risk with `n_rows` - 1 others."""
         weights, sigma = self.risk.age_probabilities[self.age :], self.sigma[: self.gaps.size, row]
         ages = np.minimum(self.age + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
-        backoff = quantile(self.risk.shares[ages] / n_rows) * self.sigma[:, row]
-        before, jumps = backoff[: self.gaps.size, None], self.jump[:, :, row]
+        backoff = compute_quantile(self.risk.row_budgets[ages] / n_rows) * self.sigma[:, row]
+        earlier_backoff, corrections = backoff[: self.gaps.size, None], self.correction[:, :, row]
 
-        def outside_excess(d: float) -> float:
+        def find_outside_excess(d: float) -> float:
             # Σ_t π_t Φ(-d / σ_t) - (1 - δ_x - P(a > H)) / n
             return (
-                float(weights @ violation_risk(np.full_like(sigma, d), sigma))
+                float(weights @ compute_violation_risk(np.full_like(sigma, d), sigma))
                 - (allowed - self.risk.older_probability) / n_rows
             )
 
-        def slack_excess(d: float) -> float:
+        def find_slack_excess(d: float) -> float:
             # Σ_t q_t max_s Φ(-(max(d, β_t) - β_s + g_s) / σ_ts) - 0.7 (1 - δ_x) / n
-            margin = np.maximum(d, before) - backoff + self.reach[:, row]
-            return float(self.gaps @ violation_risk(margin, jumps).max(axis=1)) - SLACK_SHARE * allowed / n_rows
+            margin = np.maximum(d, earlier_backoff) - backoff + self.reach[:, row]
+            return (
+                float(self.gaps @ compute_violation_risk(margin, corrections).max(axis=1))
+                - SLACK_SHARE * allowed / n_rows
+            )
 
         from scipy.optimize import brentq  # slow to import, needed for a design only
 
         distance = 0.0
-        for excess in (outside_excess, slack_excess):
-            if excess(distance) > 0.0:
-                upper = distance + float(max(self.sigma[:, row].max(), backoff.max(), jumps.max()))
-                while excess(upper) > 0.0:
+        for find_excess in (find_outside_excess, find_slack_excess):
+            if find_excess(distance) > 0.0:
+                upper = distance + float(max(self.sigma[:, row].max(), backoff.max(), corrections.max()))
+                while find_excess(upper) > 0.0:
                     upper *= 2.0
-                distance = float(brentq(excess, distance, upper))
+                distance = float(brentq(find_excess, distance, upper))
         return distance
 
 
@@ -368,9 +372,9 @@ def _make_reference_rows(
     flown_share = np.minimum.accumulate(risk.age_probabilities[age:] / risk.age_probabilities[age])
     gaps = flown_share - np.append(flown_share[1:], 0.0)
     # S_t = Σ_t - Σ_0,  var(c'A^s e) = c'A^s S_t A^s'c
-    jump_cov = step_covs[1 : gaps.size + 1] - step_covs[0]
+    correction_cov = step_covs[1 : gaps.size + 1] - step_covs[0]
     c_powers = c @ _compute_powers(plant.a, steps)  # (H+1, m, n_x)
-    variance = np.einsum("smi,tij,smj->tsm", c_powers[1:], jump_cov, c_powers[1:])
+    variance = np.einsum("smi,tij,smj->tsm", c_powers[1:], correction_cov, c_powers[1:])
     deviations = np.sqrt(np.maximum(np.einsum("mi,tij,mj->tm", c, step_covs[1:], c), 0.0))
     return _RestingRows(
         risk, age, gaps, deviations, _compute_reach(problem, slew, c_powers[:-1]), np.sqrt(np.maximum(variance, 0.0))

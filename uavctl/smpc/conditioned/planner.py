@@ -38,15 +38,15 @@ from uavctl.smpc.conditioned.backoffs import (
     DISTANT_SHARE,
     MAX_RISK,
     AgeRisk,
-    Deviations,
     Flags,
+    RowDeviations,
     allocate_by_age,
     allocate_equally,
+    compute_quantile,
     compute_reference_backoffs,
+    compute_violation_risk,
     find_binding,
-    quantile,
     reallocate_to_rows,
-    violation_risk,
 )
 from uavctl.smpc.conditioned.program import PartProgram, ReferenceEquilibria, RegulatedRows, SlewRows
 from uavctl.smpc.link import AgeModel
@@ -61,9 +61,8 @@ if TYPE_CHECKING:
 
 METHOD = "age-conditioned"
 ROUNDS = 2  # rounds of an allocation
-MAX_ROUNDS = (
-    3  # rounds if the plan does not keep its back-offs; half of the plans between two near walls need the third
-)
+# Rounds if the plan does not keep its back-offs: half of the plans between two near walls need the third.
+MAX_ROUNDS = 3
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
@@ -73,7 +72,7 @@ class _RowBackoffs(msgspec.Struct, frozen=True, eq=False):
     sigma: Array  # standard deviations (H, m)
     budgets: Array  # ε̄ of the stages (H,), infinite without a back-off
     backoff: Array  # back-offs (H, m) of rows that share the budgets equally
-    distant: Array  # most standard deviations (H, 1) of rows that the regulator's plan is not near, at first
+    distant_quantiles: Array  # most standard deviations (H, 1) of rows that the regulator's plan is not near, at first
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +81,8 @@ class _Allocation:
 
     risk: AgeRisk  # the budgets
     budgets: Array  # ε̄ of the stages (H, H)
-    shared: Array  # quantiles of rows that share the budgets equally (H, H, 1)
-    distant: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
+    quantiles: Array  # quantiles of rows that share the budgets equally (H, H, 1)
+    distant_quantiles: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
     # Distance of the reference from each row (n, m), by the number of rows that limit a target
     reference_backoffs: Array
 
@@ -138,7 +137,7 @@ class ConditionedSolver:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
-        self._tail = law.p
+        self._terminal_cost = law.p
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
         parts = find_parts(problem, self._slew.d)
         driven = {int(state) for part in parts for state in part.states}
@@ -146,7 +145,7 @@ class ConditionedSolver:
             undriven = sorted(set(range(plant.n_x)) - driven)
             raise DesignError("plant.b", f"states {undriven} are reached by no input", "give each state an input")
         self._regulated = RegulatedRows(problem, law, parts, self._slew)
-        self._deviations = Deviations(problem, parts, self.filter_plant)
+        self._deviations = RowDeviations(problem, parts, self.filter_plant)
         self._rows = self._regulated.rows
         width, hard = self._rows.size, self._regulated.hard[-1].stop
         self._parts = [
@@ -160,9 +159,9 @@ class ConditionedSolver:
         )
         self._has_equilibrium_input = bool(self._equilibria.u_eq.any())
         self._reference_equilibria = [ReferenceEquilibria(problem, self._equilibria, part) for part in parts]
-        placed = np.vstack([equilibria.rows for equilibria in self._reference_equilibria])
-        self._reference_rows = np.flatnonzero(np.any(placed != 0.0, axis=1))
-        self._placed = placed[self._reference_rows]
+        target_rows = np.vstack([equilibria.rows for equilibria in self._reference_equilibria])
+        self._reference_rows = np.flatnonzero(np.any(target_rows != 0.0, axis=1))
+        self._equilibrium_rows = target_rows[self._reference_rows]
         self._box = all(np.count_nonzero(row) == 1 for row in problem.input_set.c)
         self._low, self._high = (np.tile(side, (steps, 1)) for side in problem.input_set.bounds)
         self._no_backoff = np.broadcast_to(np.zeros(problem.input_set.b.size), (steps, problem.input_set.b.size))
@@ -174,31 +173,34 @@ class ConditionedSolver:
         n_parts = len(self._parts)
 
         def make_allocation(risk: AgeRisk) -> _Allocation:
+            # Row a, column t - 1: index of the budget of stage t of a plan from a position of age a
             ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-            budgets, reference_backoffs = risk.shares[ages], np.zeros((n_parts, width))
+            budgets, reference_backoffs = risk.row_budgets[ages], np.zeros((n_parts, width))
             reference_backoffs[:, self._reference_rows] = compute_reference_backoffs(
                 problem, risk, allowed, self._slew, self._c[self._reference_rows], cov, n_parts, self.filter_plant
             )
-            shares = budgets / max(1, width)
+            equal_budgets = budgets / max(1, width)
             return _Allocation(
                 risk,
                 budgets,
-                quantile(shares)[:, :, None],
-                quantile(DISTANT_SHARE * shares)[:, :, None],
+                compute_quantile(equal_budgets)[:, :, None],
+                compute_quantile(DISTANT_SHARE * equal_budgets)[:, :, None],
                 reference_backoffs,
             )
 
-        self._near = make_allocation(allocate_by_age(link, self._find_pacing_deviations(), allowed, exponent, n_parts))
+        self._near = make_allocation(
+            allocate_by_age(link, self._select_position_deviations(), allowed, exponent, n_parts)
+        )
         self._transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
         oldest = self._deviations.compute(None)[max(0, counts - 1)]
         self._far = np.maximum(
-            self._transit.reference_backoffs[-1], float(quantile(np.array(allowed / n_parts))) * oldest
+            self._transit.reference_backoffs[-1], float(compute_quantile(np.array(allowed / n_parts))) * oldest
         )
         # Without limits of a preview: bounds on a target far from limits, and on one that needs no reference
-        self._plain_far = (self._b - self._far)[self._reference_rows]
-        self._plain_near = (self._b - self._near.reference_backoffs[0])[self._reference_rows]
+        self._transit_bounds = (self._b - self._far)[self._reference_rows]
+        self._target_bounds = (self._b - self._near.reference_backoffs[0])[self._reference_rows]
         self._cached_rest: tuple[bytes, _Rest] | None = None
         self._cached_backoffs: tuple[tuple[bool, int, bytes], _RowBackoffs] | None = None
 
@@ -215,10 +217,10 @@ class ConditionedSolver:
     def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
         return self._select_allocation(
-            self._placed.dot(target[self._equilibria.held]), self._limits(preview), preview
+            self._equilibrium_rows.dot(target[self._equilibria.held]), self._select_limits(preview), preview
         ).risk
 
-    def reference_limits(self) -> Array:
+    def compute_reference_limits(self) -> Array:
         """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
         sides[self._rows] -= self._near.reference_backoffs[-1]
@@ -235,8 +237,8 @@ class ConditionedSolver:
             None if preview.sent is None or not self._slew.axes.size else self._slew.measure_first_step(preview.sent)
         )
         dx = x - reference
-        lower, upper, tightening = self._find_input_bounds(preview)
-        margin_x, hard = self._regulated.compute_margin(dx, rest.sides, equilibrium_input, first, tightening)
+        lower, upper, input_reduction = self._find_input_bounds(preview)
+        margin_x, hard = self._regulated.compute_margin(dx, rest.sides, equilibrium_input, first, input_reduction)
         path_z: list[tuple[PartProgram, Array]] = []
         if preview.path is not None:
             path_z = [
@@ -257,7 +259,7 @@ class ConditionedSolver:
         states[0] = x
         if equilibrium_input is not None:
             inputs += equilibrium_input
-        inputs, kept = self._clip(inputs, bool(result.z_of_program), lower, upper)
+        inputs, kept = self._clip_inputs(inputs, bool(result.z_of_program), lower, upper)
         backoff_x = np.zeros((len(states), self.problem.state_set.b.size))
         backoff_x[1:, slice(None) if self._in_order else self._rows] = result.backoff
         return Answer(
@@ -289,55 +291,61 @@ class ConditionedSolver:
         return self._cached_rest[1]
 
     def _make_rest(self, target: Array, preview: Preview) -> _Rest:
-        held, limits = self._equilibria.held, self._limits(preview)
-        placed = self._placed.dot(target[held])
-        reference = self._find_reference(target, placed, limits)
+        held, limits = self._equilibria.held, self._select_limits(preview)
+        target_rows = self._equilibrium_rows.dot(target[held])
+        reference = self._find_reference(target, target_rows, limits)
         return _Rest(
-            allocation=self._select_allocation(placed, limits, preview),
+            allocation=self._select_allocation(target_rows, limits, preview),
             reference=reference,
             sides=limits - self._c.dot(reference),
             equilibrium_input=self._equilibria.u_eq @ reference[held] if self._has_equilibrium_input else None,
             offset=float(np.abs((reference - target)[held]).sum()),
         )
 
-    def _limits(self, preview: Preview) -> Array:
+    def _select_limits(self, preview: Preview) -> Array:
         """Return the right sides of the state rows, of each stage (H, m) or of all (m,)."""
         limits: Array = self._b
         if preview.limits is not None:
             limits = preview.limits[1:] if self._in_order else preview.limits[1:, self._rows]
         return limits
 
-    def _select_allocation(self, placed: Array, limits: Array, preview: Preview) -> _Allocation:
+    def _select_allocation(self, target_rows: Array, limits: Array, preview: Preview) -> _Allocation:
         """Select the allocation of a plan, by data that do not depend on the age: all ages must share one.
 
         Args:
-            placed: Values of the rows of resting places at the target.
+            target_rows: Values of the rows of resting places at the target.
         """
         if preview.path is not None:
             return self._near
-        kept = self._plain_far
+        kept = self._transit_bounds
         if limits is not self._b:
             kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._reference_rows]
-        return self._transit if np.count_nonzero(placed <= kept) == kept.size else self._near
+        return self._transit if np.count_nonzero(target_rows <= kept) == kept.size else self._near
 
     def _find_row_backoffs(self, allocation: _Allocation, preview: Preview) -> _RowBackoffs:
-        """Return the back-offs for a preview; the last ones are cached, by the bits of their arguments."""
+        """Return the first back-offs of a plan from a position of age a; the last ones are cached, by their bits.
+
+        The age acts twice. It selects the budget of each stage, as stage t has information a + t steps old. And the
+        covariance P of the estimate, from which σ_ti follows, has grown since the position.
+        """
         key = allocation is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             sigma, age = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
+            # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
+            backoff = allocation.quantiles[age] * sigma
             self._cached_backoffs = (
                 key,
-                _RowBackoffs(sigma, allocation.budgets[age], allocation.shared[age] * sigma, allocation.distant[age]),
+                _RowBackoffs(sigma, allocation.budgets[age], backoff, allocation.distant_quantiles[age]),
             )
         return self._cached_backoffs[1]
 
-    def _find_reference(self, target: Array, placed: Array, limits: Array) -> Array:
+    def _find_reference(self, target: Array, target_rows: Array, limits: Array) -> Array:
         """Return the equilibrium (n_x,) nearest to the target; the rows that limit it share the budgets."""
-        sides, kept = limits, self._plain_near
+        sides, kept = limits, self._target_bounds
         if limits is not self._b:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
             kept = (sides - self._near.reference_backoffs[0])[self._reference_rows]
-        reference, count = np.array(target), np.count_nonzero(placed > kept)
+        reference, count = np.array(target), np.count_nonzero(target_rows > kept)
         if not count:
             return reference
         distance = self._near.reference_backoffs[min(int(count), len(self._parts)) - 1]
@@ -345,7 +353,7 @@ class ConditionedSolver:
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
 
-    def _find_pacing_deviations(self) -> Array:
+    def _select_position_deviations(self) -> Array:
         """Return the deviations (H,) for the allocation to the ages: those of the position with the largest one."""
         sigma, index = self._deviations.compute(None), list(self.problem.plant.position_index)
         rows = np.any(self._c[:, index] != 0.0, axis=1)
@@ -372,12 +380,14 @@ class ConditionedSolver:
             if not np.count_nonzero(violated_x):
                 return _PlanResult((), backoff, margin, 0)
             stages = np.flatnonzero(violated_x.any(axis=1))
-            risk = violation_risk(margin[stages], sigma[stages])
+            risk = compute_violation_risk(margin[stages], sigma[stages])
             if risk.max() <= MAX_RISK and (risk.sum(axis=1) <= budgets[stages]).all():
                 return _PlanResult((), np.minimum(backoff, np.maximum(margin, 0.0)), margin, 0)
-        near = np.logical_or.reduce(violated_x, axis=0)
-        if np.count_nonzero(near):
-            backoff = reallocate_to_rows(backoff, margin, sigma, budgets, violated_x | near, row_backoffs.distant)
+        binds_anywhere = np.logical_or.reduce(violated_x, axis=0)
+        if np.count_nonzero(binds_anywhere):
+            backoff = reallocate_to_rows(
+                backoff, margin, sigma, budgets, violated_x | binds_anywhere, row_backoffs.distant_quantiles
+            )
             violated_x = margin < backoff
         programs = [
             program
@@ -402,6 +412,7 @@ class ConditionedSolver:
                 backoff[span] = reallocate_to_rows(
                     backoff[span], margin_left[span], sigma[span], budgets[span], binds[span]
                 )
+            # What the program may use: (b - c'x_regulated) - β
             np.subtract(margin, backoff, out=self._margins_x)
             z_of_program = dict(z_of_program)
             for program in programs:
@@ -422,11 +433,11 @@ class ConditionedSolver:
         problem = self.problem
         if preview.path is None:
             # x_0'P x_0 + |z|²
-            cost = dx[0].dot(self._tail).dot(dx[0]) + sum([z.dot(z) for _, z in result.z_of_program])
+            cost = dx[0].dot(self._terminal_cost).dot(dx[0]) + sum([z.dot(z) for _, z in result.z_of_program])
         else:
             # Σ_t (x_t - p_t)'Q_x(x_t - p_t) + (u_t - r_t)'Q_u(u_t - r_t) + x_H'P x_H
             last, dx, du = dx[-1], dx[:-1] - preview.path.states, du - preview.path.inputs
-            cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
+            cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._terminal_cost @ last
         if not result.z_of_program:
             return float(cost), 0.0, ()
         excess = np.maximum(result.backoff - result.margin, 0.0)
@@ -456,9 +467,9 @@ class ConditionedSolver:
 
     def _find_input_bounds(self, preview: Preview) -> tuple[Array, Array, Array | None]:
         """Return the smallest and largest inputs of each stage, and the reduction of the rows of U (m,)."""
-        if preview.inputs is None or not self._box:
+        if preview.input_bounds is None or not self._box:
             return self._low, self._high, None
-        lower, upper = (side.clip(self._low[0], self._high[0]) for side in preview.inputs)
+        lower, upper = (side.clip(self._low[0], self._high[0]) for side in preview.input_bounds)
         c, b = self.problem.input_set.c, self.problem.input_set.b
         column = (c != 0.0).argmax(axis=1)
         coefficients = c[np.arange(len(b)), column]
@@ -468,7 +479,7 @@ class ConditionedSolver:
             np.where(np.isfinite(b), b - np.maximum(coefficients * lower[column], coefficients * upper[column]), 0.0),
         )
 
-    def _clip(self, inputs: Array, solved: bool, lower: Array, upper: Array) -> tuple[Array, bool]:
+    def _clip_inputs(self, inputs: Array, solved: bool, lower: Array, upper: Array) -> tuple[Array, bool]:
         """Return inputs (H, n_u) clipped to their limits, and whether they were within them but for rounding."""
         if not self._box:
             return clip_inputs(inputs, self.problem.input_set.c, self.problem.input_set.b)
@@ -520,7 +531,7 @@ class ConditionedDesign:
     reference_limits: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "reference_limits", self.solver.reference_limits())
+        object.__setattr__(self, "reference_limits", self.solver.compute_reference_limits())
 
     @property
     def plant(self) -> Plant:
@@ -551,7 +562,7 @@ class ConditionedDesign:
 AnyDesign: TypeAlias = "Design | ConditionedDesign"  # design of either scheme
 
 
-def conditioned_id(
+def make_conditioned_id(
     problem: ControlProblem, link: AgeModel, allowed: float, slew_mps3: float, cov: Array, filter_plant: Plant | None
 ) -> str:
     """Return the hash of the arguments of `ConditionedSolver`, without the target."""
@@ -559,7 +570,7 @@ def conditioned_id(
     return digest((METHOD, anywhere, link, allowed, slew_mps3, cov, filter_plant))
 
 
-def conditioned_record(design: ConditionedDesign) -> dict[str, object]:
+def make_conditioned_record(design: ConditionedDesign) -> dict[str, object]:
     """Return the design as plain numbers, for recordings and `uavctl design --json`."""
     plant, problem, risk = design.plant, design.solver.problem, design.solver.risk
     return {

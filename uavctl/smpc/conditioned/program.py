@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
-from uavctl.smpc.first_rows import FirstRows
 from uavctl.smpc.nominal import ControlProblem, Lqr, Part, predict_regulated
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, QuadraticProgram, Sense
 from uavctl.smpc.sets import Equilibria, Polytope, find_pairs
+from uavctl.smpc.working_set import WorkingSetGuess
 
 Index = NDArray[np.intp]
 
@@ -155,8 +155,10 @@ class PartProgram:
             max_iterations=MAX_ITERATIONS,
             linear=False,
         )
-        is_suitable = FirstRows.is_suitable(*by_stage, len(d))
-        self._guess_rows = FirstRows(*by_stage, self._program.sense).guess if is_suitable else self._guess_ramps
+        is_suitable = WorkingSetGuess.is_suitable(*by_stage, len(d))
+        self._guess_working_set = (
+            WorkingSetGuess(*by_stage, self._program.sense).guess if is_suitable else self._guess_ramps
+        )
 
     def follow_path(self, path_x: Array, path_u: Array) -> Array:
         """Return the z (n,) of least cost along a path of the whole plant (H, n_x), (H, n_u), without limits."""
@@ -187,30 +189,30 @@ class PartProgram:
             reuse_rows: Start from the active rows of the last program, which must be of the same question.
         """
         upper, lower = margins.take(self._upper), -margins.take(self._lower)
-        first_rows = None if reuse_rows else self._guess_rows(upper, lower)
+        working_set = None if reuse_rows else self._guess_working_set(upper, lower)
         # Where two back-offs overlap, the mean stays in the middle.
         crossed = upper < lower
         if np.count_nonzero(crossed):
             middle = 0.5 * (upper + lower)
             np.copyto(upper, middle, where=crossed)
             np.copyto(lower, middle, where=crossed)
-        return self._program.solve_sides(upper, lower, first_rows, reuse_rows)
+        return self._program.solve_sides(upper, lower, working_set, reuse_rows)
 
     def _guess_ramps(self, upper: Array, lower: Array) -> Sense | None:
         """Guess the active rows: the setpoint moves from the last one to the regulator's at the slew limit.
 
         It arrives in the stage where the sum of the margins of all slew rows so far is not negative.
         """
-        first_rows = None
+        working_set = None
         for i in self._slews:
             for sides, sign, state in ((upper, 1.0, ACTIVE), (lower, -1.0, BELOW)):
                 if sign * sides[i] < 0.0:
                     missing = (sign * sides[i :: self._width]).cumsum() < 0.0
-                    if first_rows is None:
-                        first_rows = self._program.sense.copy()
+                    if working_set is None:
+                        working_set = self._program.sense.copy()
                     count = int(missing.argmin()) or self._steps
-                    first_rows[i : i + count * self._width : self._width] += state
-        return first_rows
+                    working_set[i : i + count * self._width : self._width] += state
+        return working_set
 
     def add_to_plan(self, z: Array, inputs: Array, states: Array) -> None:
         """Add the effect of z to the inputs (H, n_u) and states (H+1, n_x) of the whole plant."""
@@ -300,7 +302,7 @@ class RegulatedRows:
         self.columns = _make_slices([part.rows_x.size for part in parts])  # columns of each part
         changes = np.diff(inputs, axis=0, prepend=0.0)
         hard: list[Array] = []
-        hold_maps: list[Array] = []
+        rest_maps: list[Array] = []
         input_rows: list[Index] = []
         sides: list[Array] = []
         first: list[Index] = []
@@ -309,13 +311,13 @@ class RegulatedRows:
             slew_rows = slew.find_rows(part.inputs)
             d = slew.d[slew_rows]
             hard.append(np.concatenate([c @ inputs, d @ changes, -d @ changes], axis=1).reshape(-1, n_x))
-            hold_map = np.zeros((steps, len(c) + 2 * slew_rows.size, plant.n_u))
-            hold_map[:, : len(c)] = c
+            rest_map = np.zeros((steps, len(c) + 2 * slew_rows.size, plant.n_u))
+            rest_map[:, : len(c)] = c
             input_row = np.full((steps, len(c) + 2 * slew_rows.size), -1)
             input_row[:, : len(c)] = part.rows_u
             input_rows.append(input_row.ravel())
-            hold_map[0, len(c) :] = np.concatenate([d, -d])
-            hold_maps.append(hold_map.reshape(-1, plant.n_u))
+            rest_map[0, len(c) :] = np.concatenate([d, -d])
+            rest_maps.append(rest_map.reshape(-1, plant.n_u))
             side = np.full((steps, len(c) + 2 * slew_rows.size), slew.side)
             side[:, : len(c)] = problem.input_set.b[part.rows_u]
             side[0, len(c) :] = 0.0  # set by the input sent last
@@ -323,7 +325,7 @@ class RegulatedRows:
             sides.append(side.ravel())
             first.append(np.stack([slew_rows, before + len(c) + np.arange(slew_rows.size)]))
         self.hard = _make_slices([entries.size for entries in sides])  # hard rows of each part
-        self._hard_sides, self._hold_map = np.concatenate(sides), np.vstack(hold_maps)
+        self._hard_sides, self._rest_map = np.concatenate(sides), np.vstack(rest_maps)
         rows_u = np.concatenate(input_rows)
         # Indices of the input set's rows among the hard rows, and the row of the set of each
         self._input_rows = np.flatnonzero(rows_u >= 0)
@@ -340,7 +342,7 @@ class RegulatedRows:
         self,
         dx: Array,
         sides: Array,
-        hold: Array | None,
+        equilibrium_input: Array | None,
         first: tuple[Array, Array] | None,
         input_reduction: Array | None = None,
     ) -> tuple[Array, Array]:
@@ -349,9 +351,9 @@ class RegulatedRows:
         Args:
             dx: Deviation of the state (n_x,).
             sides: Right sides of the state rows minus their values at the reference, (H, m) or (m,).
-            hold: Input at the reference (n_u,); None for zero.
+            equilibrium_input: Input at the reference (n_u,); None for zero.
             first: See `SlewRows.measure_first_step`; None if the input sent last is unknown.
-            tightening: Reduction of the right sides of the input set (m,); None: none.
+            input_reduction: Reduction of the right sides of the input set (m,); None: none.
         """
         # b - C x_t(dx), b - C u_t(dx), side ∓ D (u_t - u_(t-1))
         margin: Array = self._margin.dot(dx)
@@ -363,8 +365,8 @@ class RegulatedRows:
         hard += self._hard_sides
         if input_reduction is not None:
             hard[self._input_rows] -= input_reduction[self._row_u]
-        if hold is not None:
-            hard -= self._hold_map @ hold
+        if equilibrium_input is not None:
+            hard -= self._rest_map @ equilibrium_input
         if first is None:
             hard[self._first] = OPEN
         else:

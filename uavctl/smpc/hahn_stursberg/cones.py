@@ -262,7 +262,7 @@ class ConicProgram:
             b = self._b_const + self._b_par @ parameters
             origin = np.zeros(q.size)
             if self._origin is not None:
-                origin = self._scale.excess_over_usual(self._origin(parameters))
+                origin = self._scale.compute_excess(self._origin(parameters))
                 # z = z_0 + δ:  c += ½ z_0'P z_0 + q'z_0,  q += P z_0,  b -= A z_0
                 slope = self._p @ origin
                 constant += float((q + 0.5 * slope) @ origin)

@@ -176,7 +176,7 @@ def _search(
     for schedule in candidates:
         try:
             design = assemble_design(spec, schedule, terminal)
-        except DesignError as error:  # the limits leave no room for these likelihoods
+        except DesignError as error:  # the limits leave no margin for these likelihoods
             n_refused, last_reason = n_refused + 1, f": {error.reason}"
             continue
         costs = [cost_of(design, state) for state in spec.search_states]

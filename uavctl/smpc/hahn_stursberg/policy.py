@@ -1,7 +1,7 @@
-"""The frozen policy of one component: the gains of least covariance cost within half the room of every limit.
+"""The frozen policy of one component: the gains of least covariance cost within half the distance between limits.
 
 1. J_cov(θ) = ½ θ'Pθ + q'θ + c_0 is minimised once, in Clarabel, subject to the terminal condition and to
-   κ_i ‖noise_i(θ)‖ <= ρ_i, with ρ_i half the room between the two limits of row i.
+   κ_i ‖noise_i(θ)‖ <= ρ_i, with ρ_i half the distance between the two limits of row i.
 2. Its multipliers give a cut J_cov(θ) >= D - μ'β(θ), with the back-offs β. It holds for every θ that keeps the terminal
    condition, for any error of the solver: the multipliers are projected on the dual cones first, and D includes the
    residual of stationarity (P ≻ 0; theory notes, C).
@@ -27,7 +27,7 @@ from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row
 _MIN_WEIGHT = 1e-7
 
 # Bound of the back-off of a row with one side, in back-offs of the cheapest gains.
-_MAX_USUAL = 1e3
+_MAX_ONE_SIDED = 1e3
 
 # Largest violation of the terminal condition, scaled to unit variances.
 _MAX_VIOLATION = 1e-6
@@ -123,7 +123,7 @@ class CovarianceProblem:
 
 
 def cheapest_policy(problem: MeanProblem, max_iterations: int) -> Policy | None:
-    """Return the policy of least covariance cost whose back-offs take at most half the room between two limits.
+    """Return the policy of least covariance cost whose back-offs take at most half the distance between two limits.
 
     Variables of the program: the gains θ, and the standard deviation s_i of each gain row. None without a solution.
     """
@@ -131,10 +131,10 @@ def cheapest_policy(problem: MeanProblem, max_iterations: int) -> Policy | None:
     cov = CovarianceProblem(problem.horizon, [problem.rows[i] for i in gain_rows])
     n_theta, n_l = problem.horizon.n_theta, gain_rows.size
     # κ_i s_i <= ρ_i
-    half_room = 0.5 * (problem.upper - problem.lower)[gain_rows]
-    room = np.where(np.isfinite(half_room), half_room, _MAX_USUAL * cov.cheapest_backoffs)
+    half_distance = 0.5 * (problem.upper - problem.lower)[gain_rows]
+    max_backoff = np.where(np.isfinite(half_distance), half_distance, _MAX_ONE_SIDED * cov.cheapest_backoffs)
     blocks = [_join_columns(np.zeros((n_l, n_theta)), np.diag(cov.kappa))]
-    constants = [room]
+    constants = [max_backoff]
     cones: list[clarabel.Cone] = [clarabel.NonnegativeConeT(n_l)]
     # The reduced terminal condition: equalities, and a positive semi-definite matrix
     for part, cone in (

@@ -8,7 +8,7 @@
 4. Terminal condition: x̄_N = x_s, and ‖Y(θ)‖₂ <= 1, a semidefinite cone.
 5. `RestingPoint` is a point near the answer, to which numbers are relative: the plan that rests at the place in the
    limits nearest to the drift of the state, with the slack that this takes. From far outside the limits, the answer
-   differs from it by numbers of usual size, which the solver finds with its usual accuracy.
+   differs from it by numbers for which the solver is accurate.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ class RestingPoint:
         layout, n_x, n_y = self._layout, self._n_x, self._n_y
         x, to_target, y_now = np.split(parameters[: n_x + 2 * n_y], [n_x, n_x + n_y])
         limits = parameters[n_x + 2 * n_y :][: (self._last + 1) * self._m_x].reshape(self._last + 1, self._m_x)
-        room = limits[-1][self._placed] - self._backoff
-        y = self._project(y_now + self._drift @ x, room) - y_now
+        margin = limits[-1][self._placed] - self._backoff
+        y = self._project(y_now + self._drift @ x, margin) - y_now
         point = np.zeros(layout.size)
         point[layout.v] = self._rest @ y
         point[layout.y] = y
@@ -107,13 +107,13 @@ class RestingPoint:
         point[layout.slack] = np.maximum(np.maximum(mean - upper.ravel(), -lower.ravel() - mean), 0.0)
         if layout.miss.stop > layout.miss.start:
             point[layout.miss] = np.abs(self._end[0] @ x + self._end[1] @ y)
-            point[layout.outside] = np.maximum(self._rows @ (y_now + y) - room, 0.0)
+            point[layout.outside] = np.maximum(self._rows @ (y_now + y) - margin, 0.0)
         return point
 
-    def _project(self, y: Array, room: Array) -> Array:
-        """Project y (n_y,) to rows · y <= room, one row after another."""
+    def _project(self, y: Array, margin: Array) -> Array:
+        """Project y (n_y,) to rows · y <= margin, one row after another."""
         # y <- y - D row (row'y - side) / (row'D row),  D = diag(size²)
-        for row, side in zip(self._rows, room, strict=True):
+        for row, side in zip(self._rows, margin, strict=True):
             excess = float(row @ y) - side
             if excess > 0.0:
                 along = self._size**2 * row
@@ -274,8 +274,8 @@ class Program:
             inside = inside + relaxation
         self._builder.nonnegative(inside)
         movable = np.any(part.c_u @ part.u_eq != 0, axis=1)
-        room = part.b_u - terminal_backoff_u(design, part)
-        self._builder.nonnegative((-1.0 * ((part.c_u[movable] @ part.u_eq) @ absolute)).plus(room[movable]))
+        margin = part.b_u - terminal_backoff_u(design, part)
+        self._builder.nonnegative((-1.0 * ((part.c_u[movable] @ part.u_eq) @ absolute)).plus(margin[movable]))
 
     def _add_terminal(self, *, soft_terminal: bool) -> None:
         """Add (19c): x̄_N = x_s, hard or within a priced miss, and the reduced covariance bound."""
@@ -320,10 +320,10 @@ class Program:
                 backoff = self._backoff(self._noise_u(t, pair), float(self.design.kappa_u[t]), size)
                 self._add_pair(pair, mean, -1.0 * backoff, self._constant(self.part.b_u))
 
-    def _add_pair(self, pair: Pair, mean: Expression, room: Expression, limits: Expression) -> None:
+    def _add_pair(self, pair: Pair, mean: Expression, margin: Expression, limits: Expression) -> None:
         value = np.array([pair.c]) @ mean
         for sign, row in pair.sides:
-            self._builder.nonnegative(room - sign * value + np.eye(limits.const.size)[row : row + 1] @ limits)
+            self._builder.nonnegative(margin - sign * value + np.eye(limits.const.size)[row : row + 1] @ limits)
 
     def _backoff(self, noise: Affine, kappa: float, size: float, error_variance: float = 0.0) -> Expression:
         """Return κ (‖noise(θ)‖² + error_variance)^½ (1,): a constant, or a variable of `size` with its cone."""

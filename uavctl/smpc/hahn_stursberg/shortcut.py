@@ -1,7 +1,7 @@
 """Decisions by the exact program, and by a frozen policy where its KKT conditions prove that it gives the same.
 
-1. The frozen policy's back-offs do not depend on the question, so a small QP of the mean remains. Rows whose whole room
-   the policy takes are pinned to the middle between their limits.
+1. The frozen policy has fixed gains. So its back-offs do not depend on the question, and a small QP of the mean
+   remains. A row in which they take the whole distance between both limits is pinned to the middle.
 2. The joint problem's KKT conditions hold if the pinned QP has an optimum, the multipliers of the pinned rows are at
    most those of the policy, and no other gain row has a multiplier (theory notes, D). A row with slack has its price as
    multiplier: such an answer is refused too.
@@ -74,8 +74,8 @@ class Shortcut:
         self._program = QuadraticProgram(problem.h, problem.a, sense, price, problem.curve)
         self._h_inverse = np.asarray(np.linalg.inv(problem.h), dtype=np.float64)
         # Both sides of a pinned row have multipliers: their difference is the QP's, their sum the policy's μ.
-        half_room = 0.5 * (problem.upper - problem.lower)[self._pins]
-        self._level = policy.level - float(slope[self._pins] @ half_room)
+        half_distance = 0.5 * (problem.upper - problem.lower)[self._pins]
+        self._level = policy.level - float(slope[self._pins] @ half_distance)
 
     def solve(self, x: Array, target: Array, preview: Preview) -> list[PartAnswer | None]:
         """Solve for states (M, n_x) of the whole plant, with one target (n_x,) and preview.
@@ -96,7 +96,7 @@ class Shortcut:
         plan = problem.read_plan(qp, q)
         cost = qp.constant + self._covariance + dot_rows(q, multiply_rows(0.5 * q, problem.h) + qp.f)
         cost += dot_rows(plan.off_target, self._price)
-        # lower = c + D - μ · room/2 - ½ g'H⁻¹g - λ⁺ · above + λ⁻ · below, with g = f + A'(λ⁺ - λ⁻)
+        # lower = c + D - μ · distance/2 - ½ g'H⁻¹g - λ⁺ · above + λ⁻ · below, with g = f + A'(λ⁺ - λ⁻)
         g, plus = qp.f + multiply_rows(net, problem.a), np.maximum(net, 0.0)
         bound = (
             0.5 * dot_rows(multiply_rows(g, self._h_inverse), g) + dot_rows(plus, above) + dot_rows(net - plus, below)

@@ -49,7 +49,7 @@ class Limit:
 
     weight: Weight  # its variance, as a weight
     fixed_variance: float  # variance along it that no gain changes
-    max_variance: float  # variance whose κ standard deviations fill the room
+    max_variance: float  # variance whose κ standard deviations fill the margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class DelayedLoop:
         return Stationary(k, f, tuple(powers), (sigma + sigma.T) / 2, discount)
 
 
-# Largest share of the room that a terminal ellipsoid may fill: a design needs an interior around its target.
+# Largest share of the margin that a terminal ellipsoid may fill: a design needs an interior around its target.
 MAX_FILLED = 0.99
 # Relative cost for the optimiser where there is no stationary cost
 _UNSTABLE_COST = 1e6
@@ -158,7 +158,7 @@ class GainTask:
         return np.inf if state is None else state.value(self.weight)
 
     def filled(self, k: Array, limits: Sequence[Limit]) -> float:
-        """Return the largest share of a room that the terminal set takes, infinite for an unstable loop."""
+        """Return the largest share of a margin that the terminal set takes, infinite for an unstable loop."""
         state = self.loop.stationary(k)
         if state is None:
             return np.inf
@@ -183,7 +183,7 @@ def find_best_gain(task: GainTask, start: Array | None) -> tuple[Array, int]:
         raise DesignError(
             "smpc.k_tau",
             "no gain was found whose terminal set fits the limits: the nearest takes "
-            f"{task.filled(k, task.limits_x):.4g} of the room to a state limit (Assumption 4.3) and "
+            f"{task.filled(k, task.limits_x):.4g} of the margin to a state limit (Assumption 4.3) and "
             f"{task.filled(k, task.limits_u):.4g} of that to an input limit (4.4), and may take {MAX_FILLED}",
             "widen the limits in [sets], take a shorter smpc.tau, or lower likelihoods",
         )
@@ -294,12 +294,12 @@ class _Round:
         if self._cost <= 0.0:
             return self._start
         # SLSQP takes vectors of constraints in this form, which scipy's stubs type as numbers.
-        rooms: Any = {"type": "ineq", "fun": self._find_rooms, "jac": self._find_room_gradients}
+        margins: Any = {"type": "ineq", "fun": self._find_margins, "jac": self._find_margin_gradients}
         result = minimize(
             self._compute_value,
             (self._start / self._unit).ravel(),
             jac=self._compute_gradient,
-            constraints=rooms,
+            constraints=margins,
             method="SLSQP",
             options={"maxiter": 200, "ftol": 1e-14},
         )
@@ -324,13 +324,13 @@ class _Round:
         state = self._find_state(y)
         return np.zeros(y.size) if state is None else (state.gradient(self._weight) * self._unit).ravel() / self._cost
 
-    def _find_rooms(self, y: Array) -> Array:
+    def _find_margins(self, y: Array) -> Array:
         state = self._find_state(y)
         if state is None:
             return np.full(len(self._limits), -_UNSTABLE_COST)
         return np.array([1.0 - state.share(limit) / MAX_FILLED**2 for limit in self._limits])
 
-    def _find_room_gradients(self, y: Array) -> Array:
+    def _find_margin_gradients(self, y: Array) -> Array:
         state = self._find_state(y)
         if state is None:
             return np.zeros((len(self._limits), y.size))
@@ -348,7 +348,7 @@ class Synthesis:
     k: Array  # K_τ (n_u, n_x), block-diagonal over the independent parts of the plant
     cost: float  # stationary cost tr(Q_ξ Σ_ξ) of a step
     spectral_radius: float  # of the delayed loop
-    filled_x: float  # largest share of the room from the target to a state limit that the terminal set takes (4.3)
+    filled_x: float  # largest share of the margin from the target to a state limit that the terminal set takes (4.3)
     filled_u: float  # the same of the inputs (4.4)
     starts: int  # number of stable gains that the search began from
 
@@ -377,7 +377,7 @@ def synthesize(
         estimate_cov: Covariance of the state estimate's error (n_x, n_x), added to that of the terminal set.
 
     Raises:
-        DesignError: τ is below 1, no gain found stabilises the plant (`smpc.tau`), the target leaves no room
+        DesignError: τ is below 1, no gain found stabilises the plant (`smpc.tau`), the target leaves no margin
             (`target.position_m`), or no gain found fits the limits (`smpc.k_tau`); with the figures.
     """
     if tau < 1:
@@ -465,28 +465,28 @@ def _find_parts(
 
 
 def _square_rows(polytope: Polytope, index: Index, center: Array, kappa: float) -> Iterator[tuple[Array, float]]:
-    """List the outer product of each normal within a part, and the variance along it that fills the room.
+    """List the outer product of each normal within a part, and the variance along it that fills the margin.
 
     Of two opposite sides, which have the same variance, the nearer one counts.
 
     Raises:
-        DesignError: A limit leaves no room around the target.
+        DesignError: A limit leaves no margin around the target.
     """
     nearest: dict[bytes, tuple[Array, float]] = {}
-    for row, room in zip(polytope.c, polytope.margin(center), strict=True):
+    for row, margin in zip(polytope.c, polytope.margin(center), strict=True):
         normal = row[index]
-        if not normal.any() or room == np.inf:
+        if not normal.any() or margin == np.inf:
             continue
-        if room <= 0.0:
+        if margin <= 0.0:
             raise DesignError(
                 "target.position_m",
-                f"the target leaves no room to a limit (by {-room:.4g})",
+                f"the target leaves no margin to a limit (by {-margin:.4g})",
                 "move it away from the limits, or widen them",
             )
-        # c'Σc <= (room / κ)²; a row and its opposite, at any scale, limit the same variance
+        # c'Σc <= (margin / κ)²; a row and its opposite, at any scale, limit the same variance
         size = float(normal[np.flatnonzero(normal)[0]])
         square = np.outer(normal / size, normal / size)
-        max_variance = (room / (kappa * size)) ** 2
+        max_variance = (margin / (kappa * size)) ** 2
         previous = nearest.get(square.tobytes())
         nearest[square.tobytes()] = (square, max_variance if previous is None else min(max_variance, previous[1]))
     yield from nearest.values()

@@ -146,7 +146,7 @@ class AssumptionCheck:
     # 4.1: P(a <= τ); 4.2: spectral radius; 4.3, 4.4: half-width of the terminal set along the row that it fills most,
     # in the row's unit; 4.5: largest eigenvalue of A'PA - P + Q_ξ, relative to P_ξ
     value: float
-    # Upper bound of `value` (4.1: lower bound); 4.3, 4.4: the room from the equilibrium to the row
+    # Upper bound of `value` (4.1: lower bound); 4.3, 4.4: the margin from the equilibrium to the row
     limit: float
     text: str  # what is compared, for people
 
@@ -213,17 +213,18 @@ _HINTS = {
 def _check_fit(
     item: str, polytope: Polytope, center: Array, covariance: Array, kappa: float, quantity: str
 ) -> AssumptionCheck:
-    """Compare the terminal ellipsoid around `center` with the room to the limits, at the row that it fills most."""
+    """Compare the terminal ellipsoid around `center` with the margin to the limits, at the row that it fills most."""
     if not len(polytope.b):
         return AssumptionCheck(item, True, 0.0, np.inf, f"no {quantity} has a limit")
     # κ (c'Σc)^½ <= b - c'x_s
-    room = polytope.margin(center)
+    margin = polytope.margin(center)
     half_width = kappa * np.sqrt(np.einsum("ij,jk,ik->i", polytope.c, covariance, polytope.c))
-    share = np.divide(half_width, room, out=np.full_like(half_width, np.inf), where=room > 0)
+    share = np.divide(half_width, margin, out=np.full_like(half_width, np.inf), where=margin > 0)
     row = int(np.argmax(share))
     name = _name_row(polytope.c[row], row, quantity)
+    # The design's hash includes this text: another word would give recorded designs another hash.
     text = f"half-width of the terminal set at {name}, against the room from the target"
-    return AssumptionCheck(item, bool(half_width[row] <= room[row]), float(half_width[row]), float(room[row]), text)
+    return AssumptionCheck(item, bool(half_width[row] <= margin[row]), float(half_width[row]), float(margin[row]), text)
 
 
 def _name_row(normal: Array, row: int, quantity: str) -> str:

@@ -1,4 +1,4 @@
-"""Guess of the active rows of a program, from the fastest inputs.
+"""Guess of the working set of a program, its active rows, from the fastest inputs.
 
 1. An active-set method ends at the same optimum from any rows, after fewer iterations the nearer they are to the active
    ones.
@@ -17,23 +17,20 @@ from uavctl.smpc.qp import ACTIVE, BELOW, KEEPS_LIMIT, Sense
 
 Flags = NDArray[np.bool_]
 
-
-_ROW_SPACING = 2  # active stages along a state row: with each one, more would have to be removed than added
-
-
-_EXTRA_SHARE = (
-    1.0 / 3.0
-)  # extra time on a state row, as a share of the stages in which a plan without state rows is beyond it
+# Every second stage along a state row is active: with each one, more would have to be removed than added.
+_ROW_SPACING = 2
+# Extra time on a state row, as a share of the stages in which a plan without state rows is beyond it.
+_EXTRA_SHARE = 1.0 / 3.0
 
 
-class FirstRows:
-    """Guess of the active rows of a part with one input and one slew row. Not for concurrent use.
+class WorkingSetGuess:
+    """Guess of the working set of a part with one input and one slew row. Not for concurrent use.
 
     It uses the state rows of one direction: that which the input moves first (a speed, before a position).
 
     Args:
-        of_x: State rows (H, d, n) by z.
-        of_u: Rows (H, k, n) of a stage by z: those of the input set, then the slew row.
+        x_rows: State rows (H, d, n) by z.
+        u_rows: Rows (H, k, n) of a stage by z: those of the input set, then the slew row.
         sense: DAQP's state of all rows: all of `x_rows`, stage after stage, then all of `u_rows`.
     """
 
@@ -67,7 +64,7 @@ class FirstRows:
         return bool((u_rows[0, :, 0] > 0.0).all() and (reach[:, -1, 0] != 0.0).all() and (reach[:, 0, 0] > 0.0).any())
 
     def guess(self, upper: Array, lower: Array) -> Sense | None:
-        """Return `sense` with the first active rows, from the sides (m,) of all rows; None: no first rows."""
+        """Return `sense` with the guessed active rows, from the sides (m,) of all rows; None: no guess."""
         fast, slow = upper[self._slews], lower[self._slews]
         braked = self._reach.dot(slow)
         over = braked > upper[self._states]
@@ -86,7 +83,7 @@ class FirstRows:
     def _build_guess(
         self, upper: Array, lower: Array, braked: Array, over: Flags | None, towards: int, against: int
     ) -> Sense:
-        """Guess the rows of a plan that goes up, after it has braked while state rows are relaxed.
+        """Guess the active rows of a plan that goes up, after it has braked while state rows are relaxed.
 
         Args:
             upper: Upper sides of all rows (m,).
@@ -96,25 +93,25 @@ class FirstRows:
             towards: DAQP's state of a row at its upper side.
         """
         fast, slow, high = upper[self._slews], lower[self._slews], upper[self._states]
-        first_rows, since = self._sense.copy(), 0
-        slews, states = first_rows[self._slews], first_rows[self._states]
+        working_set, since = self._sense.copy(), 0
+        slews, states = working_set[self._slews], working_set[self._states]
         if over is not None:
             since = _find_last(over) + 1
             states[over] = self._soft + towards
             slews[:since] = self._hard + against
             if since == self._steps:
-                return first_rows
+                return working_set
             fast = np.concatenate([slow[:since], fast[since:]])
         # Up to the stage where the regulator needs no more: z_t >= 0 with z = S⁻¹ fast
         z = self._z.dot(fast)
         is_reached = z[since:] >= 0.0
         if is_reached[0]:
-            return first_rows
+            return working_set
         count = since + (int(is_reached.argmax()) or is_reached.size)
         leaves_row = self._z_columns[count][since:].dot(z[:count]) > high[since:]
         if not np.count_nonzero(leaves_row):
             slews[since:count] = self._hard + towards
-            return first_rows
+            return working_set
         # If that leaves a state row: as long as the row can still be kept, then back.
         ramp = np.add.accumulate(fast)
         top = self._top
@@ -143,13 +140,13 @@ class FirstRows:
             capped = ramp[since:count] > top[since:count]
             if np.count_nonzero(capped):
                 slews[since:count][capped] = self._hard
-                first_rows[self._inputs][since:count][capped] = self._hard + towards
+                working_set[self._inputs][since:count][capped] = self._hard + towards
         slews[count + 1 : nearest + 1] = self._hard + against
         # The plan stays on the row for longer than a free plan is beyond it.
         end = since + _find_last(leaves_row) + 1
         end += int(_EXTRA_SHARE * (end - nearest))
         states[nearest + 1 : end : _ROW_SPACING] = self._soft + towards + KEEPS_LIMIT
-        return first_rows
+        return working_set
 
 
 def _find_last(flags: Flags) -> int:

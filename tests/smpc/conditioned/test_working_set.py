@@ -10,7 +10,7 @@ from uavctl.config import load_config
 from uavctl.lab.bench.run import draw_questions
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import ConditionedSolver
-from uavctl.smpc.first_rows import FirstRows
+from uavctl.smpc.working_set import WorkingSetGuess
 
 
 def requested(name: str) -> list[Answer]:
@@ -23,7 +23,7 @@ def requested(name: str) -> list[Answer]:
 @pytest.mark.parametrize("name", ["room-px4", "room-ardupilot"])
 def test_a_guess_saves_iterations_and_changes_no_plan(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     guessed = requested(name)
-    monkeypatch.setattr(FirstRows, "is_suitable", lambda *_: False)
+    monkeypatch.setattr(WorkingSetGuess, "is_suitable", lambda *_: False)
     without = requested(name)
     compared = 0
     for item, other in zip(guessed, without, strict=True):
@@ -48,7 +48,7 @@ def chain(steps: int, lag: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_row_that_the_fastest_brake_leaves_is_relaxed() -> None:
     steps = 6
     of_x, of_u = chain(steps, 0.5)
-    first = FirstRows(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
+    first = WorkingSetGuess(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
     upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
     upper[7::2], lower[7::2] = 1.0, -1.0
     assert first.guess(upper, lower) is None
@@ -65,7 +65,7 @@ def test_a_row_that_the_fastest_brake_leaves_is_relaxed() -> None:
 def test_a_setpoint_far_from_the_regulators_goes_there_as_fast_as_it_may() -> None:
     steps = 6
     of_x, of_u = chain(steps, 0.5)
-    first = FirstRows(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
+    first = WorkingSetGuess(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
     upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
     upper[7::2], lower[7::2] = 1.0, -1.0
     upper[7] = -2.0  # what was sent last is two steps behind
