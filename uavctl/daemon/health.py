@@ -168,7 +168,7 @@ class HealthMonitor:
                 self._relay_rate = relay.sent, float(relay.sent - self._relay_rate[0])
             inertial = self._flight.inertial
             if inertial is not None:
-                used, total = (state - before for state, before in zip(inertial, self._inertial, strict=True))
+                used, total = (count - before for count, before in zip(inertial, self._inertial, strict=True))
                 self._inertial, self._inertial_share = inertial, used / total if total else None
             health = self.make_health()
             self._report_recorder(health.recorder)
