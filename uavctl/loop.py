@@ -146,8 +146,8 @@ class ControlLoop:
         self._decision: Decision | None = None
         self._orders: deque[Command] = deque()
         self._external_solve_ns = 0  # time that a controller of another package took in the last tick
-        # Last time at which positions contradicted the vehicle's climb or landing; None before.
         self._frozen_ns: int | None = None  # the last tick with frozen positions
+        # The last tick in which positions contradicted the vehicle's climb or landing
         self._position_inconsistent_ns: int | None = None
         # Not even the hand-over works any more: positions and a landing request are all that is sent.
         self._is_handover_failed = False
@@ -225,7 +225,7 @@ class ControlLoop:
 
     @property
     def breach_reason(self) -> str:
-        """Reason why a monitor has released the vehicle; empty while none has."""
+        """Reason why the envelope has let the vehicle go; empty while it has not."""
         return "" if self._state.monitors.breach is None else self._state.monitors.breach.text
 
     @property
@@ -269,8 +269,8 @@ class ControlLoop:
         answers = tuple([self._record_outgoing(link, answer, at_ns) for answer in replies]) if replies else ()
         return Received(answers, from_vehicle, from_source, console_events)
 
-    def refused(self, link: str, counts: dict[str, int], at_ns: int) -> tuple[Event, ...]:
-        """Note that a connection has dropped datagrams unread; return its events for the console.
+    def add_refusals(self, link: str, counts: dict[str, int], at_ns: int) -> tuple[Event, ...]:
+        """Add counts of datagrams that a connection has dropped unread; return its events for the console.
 
         A dropped message of the vehicle may have reported that the pilot took over. So nothing that moves the vehicle
         is sent until its next heartbeat.
@@ -319,7 +319,7 @@ class ControlLoop:
             link=output.link,
             vehicle=self._vehicle,
             answers=answers,
-            news=tuple([event for event in output.events if event.code in CONSOLE_CODES]),
+            console_events=tuple([event for event in output.events if event.code in CONSOLE_CODES]),
             notices=tuple(notices),
             step_ns=step_ns,
         )
@@ -501,7 +501,7 @@ class ControlLoop:
         """Name of the controller of another package that plans; empty where one of ours does."""
         return self._controller.outside
 
-    def answered(self, took_ns: int) -> None:
+    def note_solve_time(self, took_ns: int) -> None:
         """Note the time that a controller of another package took for its last plan; the next tick judges it."""
         self._external_solve_ns = took_ns
 
@@ -510,7 +510,7 @@ class ControlLoop:
         is_move = order in (Order.GOTO, Order.HOLD, Order.RESUME)
         return explain_move_refusal(self.handover_state, self._vehicle) if is_move else ""
 
-    def timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
+    def record_timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
         """Record the times that the shell measured around a tick."""
         estimate, at_ns = ticked.estimate, ticked.decision.at_ns
         self._put(

@@ -482,12 +482,12 @@ def replay(
             findings.begin(record)
             for command in record.commands:
                 loop.order(command)
-            loop.answered(record.answered_ns)
+            loop.note_solve_time(record.answered_ns)
             loop.tick(record.tick, record.at_ns, discard, record.missed_ticks, record.stop, core_error)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):
-            loop.refused(record.link, record.counts, record.at_ns)
+            loop.add_refusals(record.link, record.counts, record.at_ns)
         elif isinstance(record, InternalError) and record.effect is not InternalErrorEffect.TICK:
             loop.handle_failure(record, discard)
         elif isinstance(record, RecorderNote):

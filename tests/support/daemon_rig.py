@@ -32,7 +32,7 @@ class DaemonRig:
         self.told: list[tuple[str, int]] = []  # words for a person, and when they were told
         self.arrives: list[tuple[int, bytes]] = []  # what comes between ticks
         self.services: list[AfterTick] = [
-            lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.news)
+            lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.console_events)
         ]
         self.engagement: AfterTick = lambda *_: None
         self.oversleep: dict[int, int] = {}  # deadline -> how much later the sleep ends

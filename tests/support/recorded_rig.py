@@ -120,10 +120,10 @@ def listen(
             while waiting and waiting[0][0] <= now_ns:
                 assert loop.order(waiting.popleft()[1])
             ticked = loop.tick(tick, now_ns, discard)
-            news += ticked.news
+            news += ticked.console_events
             notices += ticked.notices
             tick += 1
-        news += loop.receive(VEHICLE, datagram.data, datagram.at_ns).news
+        news += loop.receive(VEHICLE, datagram.data, datagram.at_ns).console_events
     return LoopRecord(name, loop, memory, news, notices)
 
 

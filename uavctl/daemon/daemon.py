@@ -152,7 +152,7 @@ class _Flight:
     def request_landing(self) -> None:
         """Send the landing request of a flight whose cycles have failed, until it is answered. Services go on."""
         connection = self._connections[VEHICLE]
-        quiet_tick = None if self._ticked is None else replace(self._ticked, answers=(), news=(), notices=())
+        quiet_tick = None if self._ticked is None else replace(self._ticked, answers=(), console_events=(), notices=())
         while not connection.closed and self._loop.send_landing_request(
             self._now(), lambda message: connection.send(message.data)
         ):
@@ -196,11 +196,11 @@ class _Flight:
         self._follow_engagement(ticked, lateness_ns)
         bookkeeping: tuple[AfterTick, ...] = (
             lambda *_: self._report_withheld(),
-            lambda *_: loop.timing(ticked, lateness_ns, send_ns),
+            lambda *_: loop.record_timing(ticked, lateness_ns, send_ns),
             lambda *_: self._reporter.report(due.at_ns),
         )
         if loop.outside and ticked.decision.solve is not None:
-            loop.answered(ticked.step_ns)
+            loop.note_solve_time(ticked.step_ns)
         self._run_services((*bookkeeping, *self.services), ticked, lateness_ns)
         self._ticked = ticked
 
@@ -229,7 +229,7 @@ class _Flight:
 
     def _report_withheld(self) -> None:
         if self._withheld:
-            self._loop.refused(VEHICLE, {WITHHELD: self._withheld}, self._now())
+            self._loop.add_refusals(VEHICLE, {WITHHELD: self._withheld}, self._now())
 
     def _follow_engagement(self, ticked: Ticked, lateness_ns: int) -> None:
         """Let the orders of the flight be given; an error begins its end."""
@@ -347,8 +347,8 @@ class _Reader:
             connection.select_peer(index)
         elif received.from_source:
             connection.trust_sender(index)
-        if received.news:
-            self._on_events(received.news)
+        if received.console_events:
+            self._on_events(received.console_events)
         for answer in received.answers:
             self._connections[answer.link].send(answer.data)
 
@@ -358,7 +358,7 @@ class _Reader:
             before, lost = self._lost[name], connection.count_lost()
             self._lost[name] = lost
             if has_stalled and lost > before:
-                self._loop.refused(name, {OVERRUN: lost - before}, self._now())
+                self._loop.add_refusals(name, {OVERRUN: lost - before}, self._now())
 
 
 class _RefusalReporter:
@@ -385,4 +385,4 @@ class _RefusalReporter:
             new_counts = refused - self._reported[name]
             if new_counts:
                 self._reported[name] = refused
-                self._on_events(self._loop.refused(name, dict(new_counts), at_ns))
+                self._on_events(self._loop.add_refusals(name, dict(new_counts), at_ns))

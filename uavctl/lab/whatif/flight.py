@@ -291,7 +291,7 @@ def refly(
         elif isinstance(record, Datagram) and not record.outgoing:
             flight.handle_datagram(record)
         elif isinstance(record, Refused):
-            loop.refused(record.link, record.counts, record.at_ns)
+            loop.add_refusals(record.link, record.counts, record.at_ns)
         elif isinstance(record, Truth):
             flight.truths.append(record)
         if flight.is_over:
@@ -351,10 +351,10 @@ class _ReflownLoop:
         for command in record.commands:
             self._loop.order(command)
         if self._loop.outside == self._history.config.smpc.controller:
-            self._loop.answered(record.answered_ns)
+            self._loop.note_solve_time(record.answered_ns)
         self._tap.setpoint = None
         ticked = self._loop.tick(record.tick, at_ns, discard, record.missed_ticks, record.stop)
-        self._loop.timing(ticked, lateness_ns=0, send_ns=0)
+        self._loop.record_timing(ticked, lateness_ns=0, send_ns=0)
         self._steer_deviation(at_ns, ticked.decision.reason)
         self.record_truth(at_ns)
 
