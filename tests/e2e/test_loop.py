@@ -14,7 +14,7 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.event_codes import EventCode
-from uavctl.loop import MAX_SAMPLES
+from uavctl.inbox import MAX_SAMPLES
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.handover import NEW_HEARTBEAT_NS, HandoverOutput, HandoverStateMachine

@@ -19,7 +19,8 @@ from logs.recording.flight import FlightData
 from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.check.preflight import Preflight
 from uavctl.config import Config, load_config
-from uavctl.loop import VEHICLE, ControlLoop, make_links
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import VEHICLE, make_links
 from uavctl.records import Command, Event, VehicleStatus, discard
 
 FLIGHTS = DATA / "flights"

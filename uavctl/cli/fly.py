@@ -54,7 +54,8 @@ from uavctl.daemon.landing_guard import guard_landing
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.daemon.tick_limit import limit_ticks
 from uavctl.io.signed_connection import open_links
-from uavctl.loop import VEHICLE, ControlLoop
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import VEHICLE
 
 
 def fly(

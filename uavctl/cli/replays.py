@@ -32,7 +32,8 @@ from uavctl.cli.common import locate_design_errors, warn
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse_recorded
 from uavctl.errors import DesignError, RecordingError, UsageError
-from uavctl.loop import ControlLoop, make_links
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import make_links
 from uavctl.records import Header, StepInput
 
 _LIBRARY_VERSION = "uavctl 0.2.0, commit b5d416b"  # replays flights of version 0.1 and its own with a policy library

@@ -27,8 +27,8 @@ from uavctl.errors import ConnectionClosedError, TickOverdueError, UavctlError
 from uavctl.event_codes import EventCode
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
-from uavctl.loop import VEHICLE, ControlLoop
-from uavctl.mavlink.connection import OVERRUN
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import OVERRUN, VEHICLE
 from uavctl.records import Event, Outgoing, Ticked
 
 READ_PAUSE_NS = 2_000_000  # after a read without data for the flight

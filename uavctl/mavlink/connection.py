@@ -17,6 +17,7 @@ from typing import NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.arrays import SECOND_NS
+from uavctl.config import Config
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.event_codes import EventCode
@@ -551,3 +552,29 @@ class MavlinkConnection:
             count = self._unreported.total()
             events.append(self._make_event(at_ns, Severity.WARNING, EventCode.DROPPED, text, count))
         return events
+
+
+def make_links(
+    config: Config, on_message: Callable[[Message, int], None] | None = None
+) -> dict[str, MavlinkConnection]:
+    """Make the connections' protocol states: one for both roles when the two URLs are the same.
+
+    Args:
+        on_message: Called with each decoded message of others, and its time [ns].
+    """
+    shared = config.daemon.vehicle == config.daemon.mocap
+    names = {VEHICLE: (VEHICLE, MOCAP)} if shared else {VEHICLE: (VEHICLE,), MOCAP: (MOCAP,)}
+    return {
+        name: MavlinkConnection(
+            name,
+            roles=frozenset(roles),
+            daemon=config.daemon,
+            frame=config.frame,
+            clock=config.clock,
+            source=config.source,
+            estimator=config.estimator,
+            on_message=on_message,
+            vehicle_time=config.relay.enabled and config.relay.vehicle_time,
+        )
+        for name, roles in names.items()
+    }

@@ -33,8 +33,8 @@ from uavctl.errors import RecordingError
 from uavctl.flight.controller import Controller
 from uavctl.lab.figure_eight import to_vec3
 from uavctl.lab.whatif.rewrite import InertialFrames, PositionFrame, SourceFrames
-from uavctl.loop import MOCAP, VEHICLE, ControlLoop
-from uavctl.mavlink.connection import STREAM_SCHEMES
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import MOCAP, STREAM_SCHEMES, VEHICLE
 from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
 from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, discard
