@@ -34,7 +34,8 @@ from logs.recording.budget import (
     read_whole,
 )
 from logs.recording.disk import DiskFile
-from logs.recording.foreign import UnreadableError, make_unwrapper, read_mcap
+from logs.recording.foreign import read_mcap
+from logs.recording.mavros import UnreadableError, make_unwrapper
 from logs.recording.reader import (
     AttachedFile,
     Damage,
