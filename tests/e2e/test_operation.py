@@ -22,7 +22,7 @@ from sim_rig import decode
 
 from logs.recording.reader import records
 from uavctl.config import load_config
-from uavctl.daemon.engagement import compute_stop_limit_s
+from uavctl.daemon.flight_orders import compute_stop_limit_s
 from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 
