@@ -19,7 +19,7 @@ from mcap.records import Channel, Schema
 
 from logs.recording.budget import ExcessError, ReadBudget
 from logs.recording.disk import MAGIC, FileKind, detect_kind
-from logs.recording.mavlink_flight import MavlinkFlight, flight_in
+from logs.recording.mavlink_flight import MavlinkFlight, make_flight
 from logs.recording.mavros import DEFINITION_RATIO, UnreadableError, Unwrapper, make_unwrapper
 from logs.recording.mcap_records import DAMAGE_ERRORS, ChannelMessage, TornError, read_records
 from logs.recording.summary import count
@@ -342,7 +342,7 @@ def read_foreign_flight(path: Path, system: int | None = None) -> MavlinkFlight 
         return read_ulog(path)
     log = read_tlog(path) if detect_kind(path) is FileKind.TLOG else read_foreign_packets(path)
     if log is not None:
-        return flight_in(log, str(path), system)
+        return make_flight(log, str(path), system)
     if system is not None:
         raise UsageError("--system is for another program's MAVLink: a recording of ours is of one vehicle")
     return None

@@ -73,7 +73,7 @@ class ReadingOrder:
         )
 
 
-class Contents:
+class ChunkReader:
     """Reader of the messages in chunks; remembers the schemas seen so far."""
 
     def __init__(self, budget: ReadBudget) -> None:
@@ -140,11 +140,11 @@ class Contents:
             self._budget.keep(len(record))
             channel = Channel.read(ReadDataStream(BytesIO(record)))
             schema = self._schemas.get(channel.schema_id)
-            self._definitions[record] = channel.id, _definition(channel, schema), _zero_utc_ns(channel)
+            self._definitions[record] = channel.id, _make_definition(channel, schema), _read_zero_utc_ns(channel)
         return self._definitions[record]
 
 
-def _zero_utc_ns(channel: Channel) -> int:
+def _read_zero_utc_ns(channel: Channel) -> int:
     """Return how much later log times are than those of our clock [ns]; 0 in recordings of before."""
     zero_text = channel.metadata.get(ZERO_UTC, "0")
     if not (zero_text.isascii() and zero_text.isdigit()):
@@ -152,7 +152,7 @@ def _zero_utc_ns(channel: Channel) -> int:
     return int(zero_text)
 
 
-def _definition(channel: Channel, schema: Schema | None) -> Definition:
+def _make_definition(channel: Channel, schema: Schema | None) -> Definition:
     if schema is not None:
         return Definition(channel.topic, channel.message_encoding, schema.name, schema.encoding, schema.data)
     try:
@@ -160,8 +160,6 @@ def _definition(channel: Channel, schema: Schema | None) -> Definition:
     except KeyError:
         return Definition(channel.topic, channel.message_encoding)
 
-
-__all__ = ["AttachedFile", "Damage", "EndOfFile", "ReadingOrder", "RecordedMessage", "last_chunk", "scan"]
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
@@ -220,7 +218,7 @@ Buffer = bytes | mmap.mmap
 Scanned = RecordedMessage | AttachedFile | Damage | EndOfFile
 
 
-def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
+def scan_file(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
     """Yield messages, attachments and damage of one file in file order, then its `EndOfFile`.
 
     Args:
@@ -229,15 +227,15 @@ def scan(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
     Raises:
         RecordingError: the file cannot be read, is no recording at all, or lacks a message that the order wants.
     """
-    with _mapped(path) as data:
+    with _map_file(path) as data:
         if data:
-            yield from _scan(path, data, order)
+            yield from _scan_records(path, data, order)
         else:  # ended between creating and first writing
             yield EndOfFile(finished=False, complete=False)
 
 
 @contextmanager
-def _mapped(path: Path) -> Iterator[Buffer]:
+def _map_file(path: Path) -> Iterator[Buffer]:
     """Give the bytes of a file, read where they are looked at.
 
     Raises:
@@ -254,7 +252,7 @@ def _mapped(path: Path) -> Iterator[Buffer]:
         raise RecordingError(f"{path}: {error.strerror}") from error
 
 
-def last_chunk(path: Path) -> list[RecordedMessage] | None:
+def read_last_chunk(path: Path) -> list[RecordedMessage] | None:
     """Return the messages of a file's last chunk, found by its index; the others are not read.
 
     Returns:
@@ -263,22 +261,22 @@ def last_chunk(path: Path) -> list[RecordedMessage] | None:
     Raises:
         RecordingError: the file cannot be read.
     """
-    with _mapped(path) as data:
-        end = _data_end(data)
-        return None if end is None else _last_chunk(data, end + _DATA_END.size)
+    with _map_file(path) as data:
+        end = _find_data_end(data)
+        return None if end is None else _read_last_chunk(data, end + _DATA_END.size)
 
 
-def _last_chunk(data: Buffer, at: int) -> list[RecordedMessage]:
+def _read_last_chunk(data: Buffer, at: int) -> list[RecordedMessage]:
     """Return the messages of the last chunk by the summary at `at`, whose checksum is right."""
     offset = length = 0
     try:
-        for opcode, begin, _ in _summary_records(data, at):
+        for opcode, begin, _ in _iterate_summary(data, at):
             if opcode == Opcode.CHUNK_INDEX:
                 *_, offset, length = _CHUNK_INDEX.unpack_from(data, begin - _RECORD.size)
-        if not length or _whole(data, offset) != length:
+        if not length or _measure_record(data, offset) != length:
             return []
         budget = ReadBudget(len(data))
-        return list(Contents(budget).messages(_chunk(data, offset, length, budget), offset))
+        return list(ChunkReader(budget).messages(_read_chunk(data, offset, length, budget), offset))
     except (*_UNUSABLE, struct.error):  # the summary was written so
         return []
 
@@ -292,8 +290,8 @@ def count_by_topic(path: Path) -> dict[str, int] | None:
     Raises:
         RecordingError: the file cannot be read.
     """
-    with _mapped(path) as data:
-        end = _data_end(data)
+    with _map_file(path) as data:
+        end = _find_data_end(data)
         try:
             return None if end is None else _count_by_topic(data, end + _DATA_END.size)
         except (_BadRecordError, McapError, ValueError, struct.error):  # the summary was written so
@@ -303,7 +301,7 @@ def count_by_topic(path: Path) -> dict[str, int] | None:
 def _count_by_topic(data: Buffer, at: int) -> dict[str, int] | None:
     topics: dict[int, str] = {}
     counts: dict[int, int] | None = None
-    for opcode, begin, end in _summary_records(data, at):
+    for opcode, begin, end in _iterate_summary(data, at):
         if opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(BytesIO(data[begin:end])))
             topics[channel.id] = channel.topic
@@ -317,7 +315,7 @@ def _count_by_topic(data: Buffer, at: int) -> dict[str, int] | None:
     return of_topics
 
 
-def _summary_records(data: Buffer, at: int) -> Iterator[tuple[int, int, int]]:
+def _iterate_summary(data: Buffer, at: int) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, begin and end of the content of each record of a summary, without the footer."""
     while True:
         if at + _RECORD.size > len(data):
@@ -331,7 +329,7 @@ def _summary_records(data: Buffer, at: int) -> Iterator[tuple[int, int, int]]:
         yield opcode, begin, at
 
 
-def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scanned]:
+def _scan_records(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scanned]:
     size, budget = len(data), ReadBudget(len(data))
     at = len(MAGIC)
     damaged = False
@@ -340,34 +338,34 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
             yield Damage(path, 0, size, "torn in the first bytes", torn=True)
             yield EndOfFile(finished=False, complete=False)
             return
-        first = _next_chunk(data, 0, budget)
+        first = _find_next_chunk(data, 0, budget)
         if first is None:
             raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){describe_kind_error(path)}")
         yield Damage(path, 0, first, "damaged before the first whole chunk")
         at, damaged = first, True
-    contents = Contents(budget)
+    contents = ChunkReader(budget)
     while at < size:
         opcode = data[at]
         try:
-            length = _whole(data, at)
+            length = _measure_record(data, at)
             if opcode == Opcode.CHUNK:
-                yield from contents.messages(_chunk(data, at, length, budget), at, order)
+                yield from contents.messages(_read_chunk(data, at, length, budget), at, order)
             if opcode == Opcode.ATTACHMENT:
-                yield _attached(data, at, length, budget)
+                yield _read_attachment(data, at, length, budget)
             if opcode == Opcode.DATA_END:
                 stored = _DATA_END.unpack_from(data, at)[2]
-                if not damaged and stored != _crc(data, at):
+                if not damaged and stored != _compute_crc(data, at):
                     yield Damage(path, at, 0, "every chunk is whole, but something between them is damaged")
-                finished = _summary_ok(data, at + length)
+                finished = _is_summary_right(data, at + length)
                 if not finished:
                     yield Damage(path, at + length, 0, "no record is lost, but the index is damaged", _is_torn(data))
                 yield EndOfFile(finished=finished, complete=True)
                 return
             at += length
         except _UNUSABLE as error:
-            later = _next_chunk(data, at + 1, budget)
+            later = _find_next_chunk(data, at + 1, budget)
             if later is None:
-                later = _data_end(data)
+                later = _find_data_end(data)
             if later is not None and later < at:
                 later = None  # the footer points back, to bytes that were read
             if later == at:
@@ -381,7 +379,7 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
     yield EndOfFile(finished=False, complete=False)
 
 
-def _whole(data: Buffer, at: int) -> int:
+def _measure_record(data: Buffer, at: int) -> int:
     """Return the length of the record at `at` with its head, if it may stand between chunks and is not torn."""
     if at + _RECORD.size > len(data):
         raise _TornRecordError("is torn")
@@ -398,9 +396,9 @@ def _whole(data: Buffer, at: int) -> int:
     elif opcode == Opcode.ATTACHMENT:
         is_complete = length >= _ATTACHMENT_FIELDS
     elif opcode == Opcode.METADATA:
-        is_complete = _pair_length(data, inner, length) == length
+        is_complete = _measure_pair(data, inner, length) == length
     elif opcode == Opcode.HEADER:
-        is_complete = at == len(MAGIC) and _pair_length(data, inner, length) == length
+        is_complete = at == len(MAGIC) and _measure_pair(data, inner, length) == length
     else:
         is_complete = False
     if not is_complete:
@@ -408,21 +406,21 @@ def _whole(data: Buffer, at: int) -> int:
     return int(_RECORD.size + length)
 
 
-def _attached(data: Buffer, at: int, length: int, budget: ReadBudget) -> AttachedFile:
+def _read_attachment(data: Buffer, at: int, length: int, budget: ReadBudget) -> AttachedFile:
     """Return the attachment at `at`, if its checksum is right; its data are not copied."""
     budget.look(length)
     end = at + length - _CHECKSUM.size
-    if _crc(data, end, at + _RECORD.size) != _CHECKSUM.unpack_from(data, end)[0]:
+    if _compute_crc(data, end, at + _RECORD.size) != _CHECKSUM.unpack_from(data, end)[0]:
         raise _BadRecordError("has a wrong checksum")
-    name, begin = _text(data, at + _RECORD.size + _TIMES_BYTES, end)
-    media_type, begin = _text(data, begin, end)
+    name, begin = _read_text(data, at + _RECORD.size + _TIMES_BYTES, end)
+    media_type, begin = _read_text(data, begin, end)
     data_bytes = end - begin - STORED_SIZE.size
     if data_bytes < 0 or data_bytes != STORED_SIZE.unpack_from(data, begin)[0]:
         raise _BadRecordError("is no attachment")
     return AttachedFile(name, media_type, data_bytes)
 
 
-def _text(data: Buffer, at: int, end: int) -> tuple[str, int]:
+def _read_text(data: Buffer, at: int, end: int) -> tuple[str, int]:
     """Return the text at `at` in a record that ends at `end`, and the offset after it."""
     begin = at + _TEXT_LENGTH.size
     if begin > end or begin + _TEXT_LENGTH.unpack_from(data, at)[0] > end:
@@ -434,7 +432,7 @@ def _text(data: Buffer, at: int, end: int) -> tuple[str, int]:
         raise _BadRecordError("is no attachment") from error
 
 
-def _pair_length(data: Buffer, inner: int, length: int) -> int:
+def _measure_pair(data: Buffer, inner: int, length: int) -> int:
     """Return the length of a header or metadata record by those of its two fields; -1 if they do not fit."""
     if length < 8:
         return -1
@@ -444,7 +442,7 @@ def _pair_length(data: Buffer, inner: int, length: int) -> int:
     return int(8 + first + struct.unpack_from("<I", data, inner + 4 + first)[0])
 
 
-def _chunk(data: Buffer, at: int, length: int, budget: ReadBudget) -> bytes:
+def _read_chunk(data: Buffer, at: int, length: int, budget: ReadBudget) -> bytes:
     """Return the content of the chunk at `at`, if its checksum is right.
 
     Raises:
@@ -473,12 +471,12 @@ def _chunk(data: Buffer, at: int, length: int, budget: ReadBudget) -> bytes:
     return content
 
 
-def _next_chunk(data: Buffer, start: int, budget: ReadBudget) -> int | None:
+def _find_next_chunk(data: Buffer, start: int, budget: ReadBudget) -> int | None:
     """Return the offset of the next whole chunk from `start` on."""
     while (head := _CHUNK_HEAD.search(data, start)) is not None:
         at = head.start()
         try:
-            _chunk(data, at, _whole(data, at), budget)
+            _read_chunk(data, at, _measure_record(data, at), budget)
         except _UNUSABLE:
             start = at + 1
         else:
@@ -486,7 +484,7 @@ def _next_chunk(data: Buffer, start: int, budget: ReadBudget) -> int | None:
     return None
 
 
-def _data_end(data: Buffer) -> int | None:
+def _find_data_end(data: Buffer) -> int | None:
     """Return the offset of the end of data by the footer, if the footer and what it points to are whole."""
     at = len(data) - len(MAGIC) - _FOOTER.size
     if at < 0:
@@ -495,23 +493,23 @@ def _data_end(data: Buffer) -> int | None:
     end = start - _DATA_END.size
     if opcode != Opcode.FOOTER or not len(MAGIC) <= end < at or data[end] != Opcode.DATA_END:
         return None
-    return int(end) if _summary_ok(data, start) else None
+    return int(end) if _is_summary_right(data, start) else None
 
 
-def _crc(data: Buffer, end: int, begin: int = 0) -> int:
+def _compute_crc(data: Buffer, end: int, begin: int = 0) -> int:
     """Return the CRC-32 of everything from `begin` to before `end`, which are not copied."""
     with memoryview(data) as view, view[begin:end] as part:
         return zlib.crc32(part)
 
 
-def _summary_ok(data: Buffer, start: int) -> bool:
+def _is_summary_right(data: Buffer, start: int) -> bool:
     """Return whether the bytes from `start` on are a summary with the right checksum, footer and magic."""
     at = len(data) - len(MAGIC) - _FOOTER.size
     if at < start or data[at + _FOOTER.size :] != MAGIC:
         return False
     opcode, length, summary_start, _, crc = _FOOTER.unpack_from(data, at)
     is_footer = opcode == Opcode.FOOTER and length == 20 and summary_start == start
-    return bool(is_footer and crc == _crc(data, at + _FOOTER.size - _CHECKSUM.size, start))
+    return bool(is_footer and crc == _compute_crc(data, at + _FOOTER.size - _CHECKSUM.size, start))
 
 
 def _is_torn(data: Buffer) -> bool:
@@ -525,7 +523,7 @@ def _is_torn(data: Buffer) -> bool:
 R = TypeVar("R", bound=Record)
 
 
-def segment_files(path: Path) -> tuple[Path, ...]:
+def find_segments(path: Path) -> tuple[Path, ...]:
     """Return the files of a recording in order: the named one, and those that go on after a failed write.
 
     Raises:
@@ -552,7 +550,7 @@ def segment_files(path: Path) -> tuple[Path, ...]:
     return tuple(files)
 
 
-def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
+def scan_recording(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
     """Yield messages, attachments and damage of all segments; header and library that later segments repeat are marked.
 
     Args:
@@ -562,8 +560,8 @@ def walk(path: Path, order: ReadingOrder | None = None) -> Iterator[Scanned]:
         RecordingError: there is no such recording, a file of it is none, or it is not in order.
     """
     first: dict[str, bytes] = {}
-    for file in segment_files(path):
-        for item in scan(file, order):
+    for file in find_segments(path):
+        for item in scan_file(file, order):
             if isinstance(item, RecordedMessage) and item.definition.topic in (HEADER, LIBRARY):
                 yield item._replace(repeated=item.data == first.get(item.definition.topic))
                 first.setdefault(item.definition.topic, item.data)
@@ -577,12 +575,12 @@ def read(path: Path) -> Iterator[tuple[str, int, Record]]:
     Raises:
         RecordingError: no recording, or damaged; names file and offset. What came before is good.
     """
-    for message in good_messages(path):
+    for message in read_messages(path):
         topic = message.definition.topic
         yield topic, message.at_ns, decode(topic, message.data, message.at_ns)
 
 
-def lacks_end(path: Path) -> str:
+def explain_missing_end(path: Path) -> str:
     """Return why a recording's end is missing, in words; empty if it is there.
 
     Only the recorder's last word says that it is: index and footer stand in a file that was full or could not be
@@ -591,11 +589,11 @@ def lacks_end(path: Path) -> str:
     Raises:
         RecordingError: there is no such recording.
     """
-    files = segment_files(path)
-    ends = [last_chunk(file) for file in files]
+    files = find_segments(path)
+    ends = [read_last_chunk(file) for file in files]
     if None in ends:
         return "the recording is torn"
-    note = _note(ends[-1])
+    note = _find_last_note(ends[-1])
     if note is not None and note.is_end:
         return ""
     if note is not None and note.kind is NoteKind.CONTINUED:
@@ -605,21 +603,21 @@ def lacks_end(path: Path) -> str:
     return f"the recording has no end: nothing could be written after {files[-1].name}"
 
 
-def last_note(path: Path) -> RecorderNote | None:
+def read_last_note(path: Path) -> RecorderNote | None:
     """Return the last note of the recorder, or of a recovery; None where a file was not closed in order.
 
     Raises:
         RecordingError: there is no such recording.
     """
-    return _note(last_chunk(segment_files(path)[-1]))
+    return _find_last_note(read_last_chunk(find_segments(path)[-1]))
 
 
-def _note(end: list[RecordedMessage] | None) -> RecorderNote | None:
+def _find_last_note(end: list[RecordedMessage] | None) -> RecorderNote | None:
     """Return the last note in a file's last chunk."""
-    return next((note for message in reversed(end or []) if (note := note_of(message)) is not None), None)
+    return next((note for message in reversed(end or []) if (note := decode_note(message)) is not None), None)
 
 
-def note_of(message: RecordedMessage) -> RecorderNote | None:
+def decode_note(message: RecordedMessage) -> RecorderNote | None:
     """What the recorder says in a message; None in any other."""
     if message.definition.topic != RECORDER:
         return None
@@ -628,13 +626,13 @@ def note_of(message: RecordedMessage) -> RecorderNote | None:
     return note
 
 
-def records(path: Path, kind: type[R]) -> Iterator[R]:
+def read_kind(path: Path, kind: type[R]) -> Iterator[R]:
     """Yield the records of one type in file order.
 
     Raises:
         RecordingError: as `read`.
     """
-    for message in good_messages(path):
+    for message in read_messages(path):
         topic = message.definition.topic
         if is_known(topic) and issubclass(get_record_type(topic), kind):
             record = decode(topic, message.data, message.at_ns)
@@ -642,24 +640,24 @@ def records(path: Path, kind: type[R]) -> Iterator[R]:
             yield record
 
 
-def header(path: Path) -> Header:
+def read_header(path: Path) -> Header:
     """Return the header of a recording.
 
     Raises:
         RecordingError: as `read`, or it has none.
     """
-    for record in records(path, Header):
+    for record in read_kind(path, Header):
         return record
     raise RecordingError(f"{path}: no header: it was ended before its first chunk was written, or that chunk was lost")
 
 
-def good_messages(path: Path) -> Iterator[RecordedMessage]:
+def read_messages(path: Path) -> Iterator[RecordedMessage]:
     """Yield the messages, also of topics unknown to this version, without repetitions and those for viewers.
 
     Raises:
         RecordingError: as `read`.
     """
-    for item in walk(path, ReadingOrder(path)):
+    for item in scan_recording(path, ReadingOrder(path)):
         if isinstance(item, RecordedMessage):
             if not item.repeated:
                 yield item
@@ -670,29 +668,29 @@ def good_messages(path: Path) -> Iterator[RecordedMessage]:
 def _has_message(path: Path) -> bool:
     """Return whether any message of a file can be read."""
     try:
-        return any(isinstance(item, RecordedMessage) for item in scan(path))
+        return any(isinstance(item, RecordedMessage) for item in scan_file(path))
     except RecordingError:  # not a recording
         return False
 
 
 def _lacks_messages(path: Path, following: Path | None) -> bool:
     """Return whether messages may be missing between the end of a file and the next one, or the recording's end."""
-    end = last_chunk(path)
+    end = read_last_chunk(path)
     if not end:
         return True
     if following is None:
-        note = _note(end)
+        note = _find_last_note(end)
         return note is None or not note.is_end
-    first = next((item for item in scan(following) if isinstance(item, RecordedMessage)), None)
+    first = next((item for item in scan_file(following) if isinstance(item, RecordedMessage)), None)
     return first is None or first.sequence != end[-1].sequence + 1
 
 
 def _continues(path: Path) -> bool:
     """Return whether a file is followed by another one of the same recording."""
-    for count, item in enumerate(scan(path)):
+    for count, item in enumerate(scan_file(path)):
         if not isinstance(item, RecordedMessage):
             return True  # empty or damaged: better told than passed over
-        if (note := note_of(item)) is not None:
+        if (note := decode_note(item)) is not None:
             return note.segment > 1
         if count == 1:
             break

@@ -17,7 +17,7 @@ import numpy as np
 from logs.recording.budget import read_whole
 from logs.recording.disk import describe_kind_error, refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.export import Watch, count_messages, ignore_progress
-from logs.recording.reader import RecordedMessage, good_messages, header
+from logs.recording.reader import RecordedMessage, read_header, read_messages
 from logs.recording.summary import count
 from logs.recording.topics import parse_raw_topic
 from uavctl.config.load import parse_stored_toml
@@ -312,13 +312,13 @@ def export_tlog(
             file cannot be written.
         UsageError: There is no such connection, or the file exists and is not to be overwritten.
     """
-    first = header(flight)
+    first = read_header(flight)
     zero_utc_ns = find_utc_of_zero(flight, first)
     refuse_existing_files([file], force=force)
     packets: Counter[str] = Counter()
     raw = _Raw(_find_streams(first))
     with remove_on_error([file]), write_temporary_files([file]) as parts, parts[file].open("wb") as out:
-        messages = watch(good_messages(flight), count_messages(flight), "writing")
+        messages = watch(read_messages(flight), count_messages(flight), "writing")
         for at_ns, topic, packet in _merge_packets(raw.packets(messages, link)):
             out.write(_STAMP.pack((zero_utc_ns + at_ns) // 1000) + packet)
             packets[topic] += 1

@@ -167,7 +167,7 @@ class _Reader:
         sources = dict(sorted(self._sources(), key=lambda item: -len(item[1].track)))
         own_source, own_positions = self._read_own_positions()
         stamps = {_make_topic_name(topic): topic.data["timestamp"].astype(np.float64) for topic in self._topics()}
-        ages = {name: neutral.ages_of(source, origin_ns) for name, source in sources.items()}
+        ages = {name: neutral.make_ages(source, origin_ns) for name, source in sources.items()}
         setpoints, attitude, height, battery = self._setpoints(), self._attitude(), self._height(), self._battery()
         system = int(log.initial_parameters.get("MAV_SYS_ID", 1))  # as PX4 comes
         info = neutral.MavlinkFlightInfo(
@@ -178,7 +178,7 @@ class _Reader:
             vehicle_system=system,
             own_positions=len(own_positions),
             own_source=own_source if own_positions else "",
-            sent=tuple(neutral.figures_of(name, source, ages[name]) for name, source in sources.items()),
+            sent=tuple(neutral.make_source_figures(name, source, ages[name]) for name, source in sources.items()),
             setpoints=len(setpoints[0]),
             modes=tuple(self._modes()),
             texts=tuple(self._texts()),
@@ -198,8 +198,8 @@ class _Reader:
         )
         flight = MavlinkFlight(
             info=info,
-            own=neutral.track_of(own_positions, origin_ns),
-            sent={name: neutral.track_of(source.track, origin_ns) for name, source in sources.items()},
+            own=neutral.make_track(own_positions, origin_ns),
+            sent={name: neutral.make_track(source.track, origin_ns) for name, source in sources.items()},
             ages=ages,
             setpoint_t_s=setpoints[0],
             setpoint_m=setpoints[1][:, :3],
@@ -212,7 +212,7 @@ class _Reader:
             battery_t_s=battery[0],
             battery_v=battery[1],
         )
-        return neutral.with_parts(flight)
+        return neutral.name_missing_parts(flight)
 
     def _span(self) -> tuple[int, int]:
         """Return when the log begins and ends [µs]; leave out what has a stamp far from all others.
@@ -283,7 +283,10 @@ class _Reader:
         return [
             (
                 int(fields["timestamp"][t]) * 1000,
-                (*neutral.from_home(float(lat_deg[t]), float(lon_deg[t]), home_deg), height_m[at[0]] - height_m[t]),
+                (
+                    *neutral.compute_offset_m(float(lat_deg[t]), float(lon_deg[t]), home_deg),
+                    height_m[at[0]] - height_m[t],
+                ),
                 unknown,
             )
             for t in at

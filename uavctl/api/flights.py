@@ -15,7 +15,7 @@ from logs.recording.disk import refuse_recording_path
 from logs.recording.ends import create_recording, describe_ending
 from logs.recording.export import list_tables, read_table
 from logs.recording.flight import FlightData
-from logs.recording.reader import header, lacks_end, records
+from logs.recording.reader import explain_missing_end, read_header, read_kind
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
 from uavctl.api.control import Runs, Signal, SolvedPlan, Source, get_limits, list_signals, load, resolve_config
@@ -59,7 +59,7 @@ class Recording:
         Raises:
             RecordingError: The recording has no header.
         """
-        return parse_recorded(header(self.path).config_toml, f"{self.path} (configuration)").config
+        return parse_recorded(read_header(self.path).config_toml, f"{self.path} (configuration)").config
 
     @cached_property
     def data(self) -> FlightData:
@@ -137,7 +137,7 @@ def read(path: str | Path, *, torn: bool = False) -> Recording:
         RecordingError: There is none, it is damaged, or it has no end and `torn` is not set.
     """
     path = Path(path)
-    end_problem = lacks_end(path)
+    end_problem = explain_missing_end(path)
     if end_problem and not torn:
         raise RecordingError(
             f"{path}: {end_problem}; read(path, torn=True) reads it as far as it goes, `uavctl log recover` restores it"
@@ -211,7 +211,7 @@ def fly(
             raise
         finally:
             status = flight.close()
-    truth = tuple(records(path, Truth))
+    truth = tuple(read_kind(path, Truth))
     return Flight(
         config=flight_config,
         ending=describe_ending(flight.loop.ending, status),

@@ -21,7 +21,7 @@ from logs.recording.export import count_messages
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import header, lacks_end, read
+from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER
@@ -114,7 +114,7 @@ def whatif(
     if seed is not None and link_name == RECORDED:
         raise UsageError("--seed is of a simulated link; add --link configured, or --link KEY=VALUE")
     check_first_file(flight)
-    recorded = header(flight)
+    recorded = read_header(flight)
     match_arithmetic(recorded)
     before = parse_recorded(recorded.config_toml, f"{flight} (configuration)").config
     loaded = change_config(before, recorded.config_toml, flight, config, overrides)
@@ -195,7 +195,7 @@ def _print_warnings(flight: Path, recorded: Header, history: RecordedFlight) -> 
     )
     if lost_records:
         texts.append(f"{count(lost_records, 'record')} missing in the recording")
-    if cut := lacks_end(flight):
+    if cut := explain_missing_end(flight):
         texts.append(f"{cut}: flown up to there")
     for text in texts:
         warn(text)
