@@ -11,9 +11,10 @@ from pathlib import Path
 import msgspec
 
 from logs.recording.design_view import get_config_name
+from logs.recording.file_scan import AttachedFile, Damage, EndOfFile, RecordedMessage
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader, VehicleParameter
-from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, find_segments, scan_recording
+from logs.recording.reader import find_segments, scan_recording
 from logs.recording.topics import HEADER, LIBRARY, PARAMETER, RECORDER, decode, parse_raw_topic
 from uavctl.errors import RecordingError
 from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth

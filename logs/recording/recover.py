@@ -9,9 +9,10 @@ import msgspec
 
 from logs.recording import attachments
 from logs.recording.disk import DiskFile
+from logs.recording.file_scan import AttachedFile, Damage, EndOfFile, RecordedMessage
 from logs.recording.notes import END_MISSING, MESSAGES_LOST, NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader
-from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, decode_note, scan_recording
+from logs.recording.reader import decode_note, scan_recording
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.topics import HEADER, PARAMETER, RECORDER, decode, encode, get_definition, parse_raw_topic
 from uavctl.errors import RecordingError

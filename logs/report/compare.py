@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from logs.recording.file_scan import RecordedMessage
 from logs.recording.flight import FlightData
 from logs.recording.info import read_info
 from logs.recording.parameters import VehicleParameter
-from logs.recording.reader import RecordedMessage, read, read_messages
+from logs.recording.reader import read, read_messages
 from logs.recording.replay import find_different_leaves
 from logs.recording.summary import FlightSummary, Percentiles, compute_position_errors_m, summarise
 from logs.recording.topics import HEADER, LIBRARY, RECORDER, decode, parse_raw_topic

@@ -16,9 +16,10 @@ from places import ROOT
 from recording_fakes import Clock, Disk, Item, drop_recorder_notes, flight, record_flight, stored_byte
 
 from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.file_scan import Damage, RecordedMessage, scan_file
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import Damage, RecordedMessage, find_segments, read, read_kind, scan_file
+from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import Recorder, SyncRecorder
 from logs.recording.recover import recover
 from sim.simulation import World

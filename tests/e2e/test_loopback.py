@@ -16,8 +16,9 @@ from report_rig import omit_figures, omit_pages
 from udp_rig import assert_in_order, fly_over_udp
 
 import uavctl
+from logs.recording.file_scan import RecordedMessage
 from logs.recording.flight import FlightData
-from logs.recording.reader import RecordedMessage, read, read_kind, scan_recording
+from logs.recording.reader import read, read_kind, scan_recording
 from logs.recording.summary import summarise
 from uavctl.cli.app import run
 from uavctl.cli.flying import draw_page

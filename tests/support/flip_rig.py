@@ -12,8 +12,9 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from recording_fakes import HEADER, Clock, Item, drop_recorder_notes, flight
 
+from logs.recording.file_scan import RecordedMessage, scan_file
 from logs.recording.info import RecordingInfo, read_info
-from logs.recording.reader import RecordedMessage, read, read_header, scan_file
+from logs.recording.reader import read, read_header
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.topics import get_definition

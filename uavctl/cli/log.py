@@ -17,12 +17,13 @@ from rich.text import Text
 from logs.recording.attachments import make_layout_text
 from logs.recording.disk import FileKind, detect_kind
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
+from logs.recording.file_scan import RecordedMessage
 from logs.recording.foreign import read_foreign_flight
 from logs.recording.info import PositionLoss, RecordingInfo
 from logs.recording.info import read_info as read_info
 from logs.recording.mavlink_flight import MavlinkFlightInfo, format_rate, list_facts
 from logs.recording.parameters import VehicleParameter, count_parameters
-from logs.recording.reader import RecordedMessage, explain_missing_end
+from logs.recording.reader import explain_missing_end
 from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as recover_recording
 from logs.recording.summary import count

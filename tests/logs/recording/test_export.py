@@ -22,7 +22,8 @@ from recording_fakes import record_flight, stored_byte
 
 from logs.recording.disk import DiskFile
 from logs.recording.export import TableFormat, export_tables, make_file_stem
-from logs.recording.reader import RecordedMessage, find_segments, read, read_messages
+from logs.recording.file_scan import RecordedMessage
+from logs.recording.reader import find_segments, read, read_messages
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.tlog import export_tlog

@@ -9,9 +9,10 @@ from recording_fakes import Clock, Disk, drop_recorder_notes, flight, round_reco
 from view_rig import fly_view, record
 
 from logs.recording.derived_topics import VIEWS
+from logs.recording.file_scan import RecordedMessage, scan_file
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import RecordedMessage, find_segments, read, read_kind, scan_file
+from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment

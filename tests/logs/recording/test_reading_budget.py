@@ -34,18 +34,18 @@ from logs.recording.budget import (
     read_whole,
 )
 from logs.recording.disk import DiskFile
-from logs.recording.foreign import read_mcap
-from logs.recording.mavros import UnreadableError, make_unwrapper
-from logs.recording.reader import (
+from logs.recording.file_scan import (
     AttachedFile,
     Damage,
     EndOfFile,
     RecordedMessage,
     Scanned,
     read_last_chunk,
-    read_messages,
     scan_file,
 )
+from logs.recording.foreign import read_mcap
+from logs.recording.mavros import UnreadableError, make_unwrapper
+from logs.recording.reader import read_messages
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment

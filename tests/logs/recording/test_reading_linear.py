@@ -12,8 +12,8 @@ from foreign_rig import TLOGS, rows_of, write
 from ulog_writer import UlogWriter
 from work_rig import count_lines
 
+from logs.recording.file_scan import scan_file
 from logs.recording.foreign import read_mcap
-from logs.recording.reader import scan_file
 from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.config.document import find_excess, find_key_lines, read_text

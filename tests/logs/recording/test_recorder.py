@@ -12,8 +12,9 @@ from view_rig import fly_view
 import logs.recording.recorder as recorder_module
 from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.file_scan import RecordedMessage, scan_file
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import RecordedMessage, find_segments, read, read_kind, scan_file
+from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import (
     RECORDS,
     VIEWS,
