@@ -280,7 +280,7 @@ class ControlLoop:
     def _relay_positions(self, inputs: StepInput, output: TickOutput, send: Send, notices: list[Event]) -> None:
         """Pass positions on to the vehicle, but those that contradict its climb or landing."""
         at_ns = inputs.at_ns
-        if output.position_inconsistent and self._hand_over.has_begun:
+        if output.position_inconsistent and self._hand_over.is_climbing_or_landing:
             self._position_inconsistent_ns = at_ns
         if not self._is_relay_enabled:
             return
@@ -329,7 +329,7 @@ class ControlLoop:
         if not self.account.control_error:
             try:
                 self._state, output = run_tick(
-                    self._state, inputs, self._controller, is_climbing_or_landing=self._hand_over.has_begun
+                    self._state, inputs, self._controller, is_climbing_or_landing=self._hand_over.is_climbing_or_landing
                 )
             except (Exception, TickOverdueError) as error:  # noqa: BLE001 the vehicle may fly by relayed positions
                 notices.append(self._fail_core(_describe_error(error), inputs.at_ns))

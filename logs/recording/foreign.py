@@ -150,7 +150,7 @@ class _ChannelStream:
             RecordingError: Its log times are all zero.
         """
         clock = MonotonicClock()
-        pieces = [(clock.steady(at_ns), data) for at_ns, data in self._pieces]
+        pieces = [(clock.convert(at_ns), data) for at_ns, data in self._pieces]
         # A recorder of several threads writes not in order; a clock that was set back has been put right.
         stream = cut_stream(sorted(pieces, key=lambda piece: piece[0]))
         notes = []
@@ -164,7 +164,7 @@ class _ChannelStream:
         clock.check(self.topic)
         if stream.left_out_bytes:
             notes.append(f"{self.topic}: {count(stream.left_out_bytes, 'byte')} left out that are no whole frame")
-        return stream.packets, (*notes, *clock.notes(self.topic))
+        return stream.packets, (*notes, *clock.describe_oddities(self.topic))
 
     def describe(self) -> str:
         """Describe what the channel holds, for an error."""

@@ -51,7 +51,7 @@ _OWN = ("LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "GPS_RAW_INT")
 _GLOBAL_LAYOUT = MessageLayout(mavlink.MAVLink_global_position_int_message)
 _EARTH_M = 6_371_000.8  # mean radius
 _WINDOW_NS, _AHEAD_NS = 10_000_000_000, 20_000_000  # of a source's clock, as the daemon judges it
-_LARGEST_V = 1000.0  # of a battery that flies; beyond, it is no voltage
+_MAX_BATTERY_V = 1000.0  # of a battery that flies; beyond, it is no voltage
 _AXES = {"ned": (1, 1, 1), "flu": (1, -1, -1)}
 
 
@@ -293,7 +293,7 @@ class _Reader:
                 self._attitudes.setdefault(message.quaternion, []).append((at_ns, message.angles_rad))
             # An autopilot without a battery's sensor sends 0 V from the start; a battery may fall to it.
             case Battery(voltage_v=float(voltage_v)) if is_vehicle and (voltage_v > 0 or self._battery):
-                if voltage_v < _LARGEST_V:
+                if voltage_v < _MAX_BATTERY_V:
                     self._battery.append((at_ns, voltage_v))
 
     @property

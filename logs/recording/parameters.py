@@ -35,7 +35,7 @@ _TYPES = {
 _NUMBERS = {name: number for number, name in _TYPES.items()}
 _INTEGERS = {"UINT8": "<B", "INT8": "<b", "UINT16": "<H", "INT16": "<h", "UINT32": "<I", "INT32": "<i"}
 _HASH = "_HASH_CHECK"  # PX4's checksum over all of them, told as one; any setting changes it
-_MOST = 20_000  # parameters kept: a vehicle has one or two thousand
+_MAX_PARAMETERS = 20_000  # parameters kept: a vehicle has one or two thousand
 
 
 class VehicleParameter(msgspec.Struct, frozen=True, kw_only=True):
@@ -107,7 +107,7 @@ class ParameterReader:
                 self._autopilots.setdefault(fields.src_system, fields.autopilot)
             return
         key = fields.src_system, fields.src_component, decode_text(fields.param_id)
-        if key[2] != _HASH and (len(self._values) < _MOST or key in self._values):
+        if key[2] != _HASH and (len(self._values) < _MAX_PARAMETERS or key in self._values):
             self._values[key] = fields.param_value, fields.param_type
             self._counts[key[:2]] = fields.param_count
 

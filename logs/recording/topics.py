@@ -181,7 +181,7 @@ def _make_any_schema(kind: type) -> dict[str, object]:
 _MAX_TIME_NS = 2**64 - 1
 MATRICES = ("inputs", "states", "backoff_x", "backoff_u")  # of a plan, rounded in recordings
 DIGITS = 4  # of them: of 3 m, a millimetre
-_LEAST = 1e-12  # a smaller number is left as it is: its power of ten would not be exact
+_MIN_ROUNDED = 1e-12  # a smaller number is left as it is: its power of ten would not be exact
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -245,7 +245,7 @@ def round_plan(plan: Plan) -> Plan:
 def _round(values: Array) -> Array:
     """Round to `DIGITS` significant digits; what is zero, too small or not finite stays."""
     size = np.abs(values)
-    counts = (size > _LEAST) & (size < np.inf)
+    counts = (size > _MIN_ROUNDED) & (size < np.inf)
     # scale = 10^(digits − 1 − floor(log10 |x|)), rounded = rint(x · scale) / scale
     digits = DIGITS - 1 - np.floor(np.log10(np.where(counts, size, 1.0)))
     up, down = 10.0 ** np.maximum(digits, 0.0), 10.0 ** np.maximum(-digits, 0.0)  # exact powers: no digit is added

@@ -23,7 +23,7 @@ from logs.recording.disk import ULOG_MAGIC, FileKind, describe_kind_error, detec
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
-from logs.recording.tlog import LONGEST_SILENCE_NS
+from logs.recording.tlog import MAX_SILENCE_NS
 from uavctl.arrays import Array
 from uavctl.errors import RecordingError, need
 from uavctl.mavlink.message_layout import strip_escapes
@@ -37,11 +37,11 @@ _PLACES = {
     "sensor_gps": (("latitude_deg", "longitude_deg", "altitude_msl_m"), (1.0, 1.0)),
     "vehicle_gps_position": (("lat", "lon", "alt"), (1e-7, 1e-3)),
 }
-_LEAST_FIX = 3  # of `fix_type`: a place in three dimensions
-_LEAST_BYTES = {"D": 2, "L": 9, "C": 11, "A": 4, "R": 2, "O": 2, "P": 1, "Q": 2, "I": 1, "M": 2}  # of messages by type
-_KNOWN_TYPES = frozenset(map(ord, (*_LEAST_BYTES, "F", "S", "B")))
-_LONGEST = 10_000  # of a message of a type that is not known; beyond, it is damage
-_MOST_READ = 20  # times that a damaged file is read over: one that is whole is read once
+_MIN_FIX = 3  # of `fix_type`: a place in three dimensions
+_MIN_BYTES = {"D": 2, "L": 9, "C": 11, "A": 4, "R": 2, "O": 2, "P": 1, "Q": 2, "I": 1, "M": 2}  # of messages by type
+_KNOWN_TYPES = frozenset(map(ord, (*_MIN_BYTES, "F", "S", "B")))
+_MAX_BYTES = 10_000  # of a message of a type that is not known; beyond, it is damage
+_MAX_READS = 20  # times that a damaged file is read over: one that is whole is read once
 # Of memory for all fields of all topics, spelled out: formats within formats may claim billions. A log of PX4 has
 # some ten thousand fields with names of thirty characters.
 _MAX_FIELD_BYTES = 2**25
@@ -119,7 +119,7 @@ class _BoundedFile(io.BytesIO):
 
     def __init__(self, data: bytearray) -> None:
         super().__init__(data)
-        self._reads_left, self._bytes_left = len(data), _MOST_READ * len(data)
+        self._reads_left, self._bytes_left = len(data), _MAX_READS * len(data)
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read bytes; none once each byte was read too often."""
@@ -144,9 +144,9 @@ def _remove_short_messages(data: bytearray) -> tuple[int, int]:
         length, kind = int.from_bytes(data[at : at + 2], "little"), data[at + 2]
         if at + 3 + length > end:
             break
-        if kind not in _KNOWN_TYPES and not 0 < length <= _LONGEST:
+        if kind not in _KNOWN_TYPES and not 0 < length <= _MAX_BYTES:
             return short, 0  # damage: where the next message begins is not known
-        if length < _LEAST_BYTES.get(chr(kind), 0):
+        if length < _MIN_BYTES.get(chr(kind), 0):
             data[at + 2], short = _SYNC, short + 1
         at += 3 + length
     return short, end - at if end == len(data) else 0
@@ -225,7 +225,7 @@ class _Reader:
         if not stamp_arrays:
             return begin_us, max(begin_us, int(self._log.last_timestamp))
         at_us = np.sort(np.concatenate(stamp_arrays))
-        cuts = np.flatnonzero(np.diff(at_us) > LONGEST_SILENCE_NS // 1000) + 1
+        cuts = np.flatnonzero(np.diff(at_us) > MAX_SILENCE_NS // 1000) + 1
         longest = max(np.split(at_us, cuts), key=len)
         first_us, last_us = int(longest[0]), int(longest[-1])
         if strays := len(at_us) - len(longest):
@@ -235,7 +235,7 @@ class _Reader:
                 is_within = (stamps >= longest[0]) & (stamps <= longest[-1])
                 topic.data = {name: values[is_within] for name, values in topic.data.items()}
         # What held before the log began is logged with its own, earlier stamp.
-        near = abs(begin_us - first_us) * 1000 <= LONGEST_SILENCE_NS and begin_us <= last_us
+        near = abs(begin_us - first_us) * 1000 <= MAX_SILENCE_NS and begin_us <= last_us
         return begin_us if near else first_us, last_us
 
     def _list_topics(self, *names: str) -> Iterator[Any]:
@@ -276,7 +276,7 @@ class _Reader:
             np.isfinite(lat_deg + lon_deg + height_m) & (np.abs(lat_deg) <= 90) & ((lat_deg != 0) | (lon_deg != 0))
         )
         if "fix_type" in fields:
-            is_valid &= fields["fix_type"] >= _LEAST_FIX
+            is_valid &= fields["fix_type"] >= _MIN_FIX
         at = np.flatnonzero(is_valid)
         if not len(at):
             return []

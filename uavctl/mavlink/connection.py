@@ -71,7 +71,7 @@ MAX_OPEN_REQUESTS = 8  # requests that still accept an answer
 MAX_ANSWERS, ANSWER_WINDOW_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_EVENT_NS = 10_000_000_000  # between two events about slow answers
-MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three missing heartbeats
+NO_HEARTBEAT_NS = 3 * SECOND_NS  # of positions without a heartbeat, which comes once a second
 TIMESYNC_FLOOD = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system before it was read; perhaps the newest state of the vehicle
 # Code of a lost connection: what happened, and what follows.
@@ -508,7 +508,7 @@ class MavlinkConnection:
             since_ns is not None
             and self.vehicle is None
             and not self._is_no_heartbeat_reported
-            and at_ns - since_ns >= MISSING_HEARTBEAT_NS
+            and at_ns - since_ns >= NO_HEARTBEAT_NS
         ):
             self._is_no_heartbeat_reported = True
             sender = self._no_heartbeat_address and self._no_heartbeat_address[0]
