@@ -27,8 +27,8 @@ from urllib.parse import quote
 
 import msgspec
 
-from logs.recording.disk import refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.file_scan import RecordedMessage, count_by_topic
+from logs.recording.output_files import refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.reader import explain_missing_end, find_segments, read_messages
 from logs.recording.topics import HEADER, LIBRARY, decode, get_record_type, is_known, is_view
 from uavctl.config.load import find_nearest

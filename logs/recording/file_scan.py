@@ -25,7 +25,7 @@ from mcap.records import Channel, Schema, Statistics
 from zstandard import ZstdDecompressor, ZstdError, get_frame_parameters
 
 from logs.recording.budget import ExcessError, ReadBudget
-from logs.recording.disk import MAGIC, describe_kind_error
+from logs.recording.file_kind import MAGIC, describe_kind_error
 from logs.recording.segment import CHUNK, CHUNK_FIELDS, COMPRESSION, INDEX, MESSAGE, STORED_SIZE, ZERO_UTC
 from logs.recording.topics import Definition, get_definition
 from uavctl.errors import RecordingError

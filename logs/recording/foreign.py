@@ -18,7 +18,7 @@ from typing import BinaryIO
 from mcap.records import Channel, Schema
 
 from logs.recording.budget import ExcessError, ReadBudget
-from logs.recording.disk import MAGIC, FileKind, detect_kind
+from logs.recording.file_kind import MAGIC, FileKind, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, make_flight
 from logs.recording.mavros import DEFINITION_RATIO, UnreadableError, Unwrapper, make_unwrapper
 from logs.recording.mcap_records import DAMAGE_ERRORS, ChannelMessage, TornError, read_records

@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Schema
 
 from logs.recording.budget import ReadBudget
-from logs.recording.disk import MAGIC
+from logs.recording.file_kind import MAGIC
 
 # Errors of the library, and of the formats within, on bytes that are no MCAP.
 DAMAGE_ERRORS = (McapError, ValueError, OverflowError, RuntimeError, struct.error, zstandard.ZstdError)

@@ -42,7 +42,8 @@ from mcap.records import (
 from mcap.records import SummaryOffset as Group
 from zstandard import ZstdCompressor
 
-from logs.recording.disk import MAGIC, OutputFile, is_present, make_segment_path
+from logs.recording.disk import OutputFile, is_present, make_segment_path
+from logs.recording.file_kind import MAGIC
 from logs.recording.topics import HEADER, Definition, get_definition, is_view
 from uavctl.config.types import LogConfig
 

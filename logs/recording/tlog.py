@@ -15,9 +15,10 @@ import msgspec
 import numpy as np
 
 from logs.recording.budget import read_whole
-from logs.recording.disk import describe_kind_error, refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.export import Watch, count_messages, ignore_progress
+from logs.recording.file_kind import describe_kind_error
 from logs.recording.file_scan import RecordedMessage
+from logs.recording.output_files import refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.reader import read_header, read_messages
 from logs.recording.summary import count
 from logs.recording.topics import parse_raw_topic

@@ -19,7 +19,7 @@ import numpy as np
 
 from logs.recording import mavlink_flight as neutral
 from logs.recording.budget import ExcessError, read_whole
-from logs.recording.disk import ULOG_MAGIC, FileKind, describe_kind_error, detect_kind
+from logs.recording.file_kind import ULOG_MAGIC, FileKind, describe_kind_error, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count

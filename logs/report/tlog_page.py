@@ -9,8 +9,8 @@ import numpy as np
 from markupsafe import Markup
 
 from logs.recording.design_view import AXIS_NUMBER
-from logs.recording.disk import write_atomically
 from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, format_rate, list_facts
+from logs.recording.output_files import write_atomically
 from logs.report import page
 from logs.report.figures import thin_keeping_largest
 from logs.report.page import Mark, PageSection

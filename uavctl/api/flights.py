@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 import numpy as np
 
-from logs.recording.disk import refuse_recording_path
 from logs.recording.ends import create_recording, describe_ending
 from logs.recording.export import list_tables, read_table
 from logs.recording.flight import FlightData
+from logs.recording.output_files import refuse_recording_path
 from logs.recording.reader import explain_missing_end, read_header, read_kind
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise

@@ -14,7 +14,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import FileKind, detect_kind, refuse_recording_path, write_atomically
+from logs.recording.file_kind import FileKind, detect_kind
+from logs.recording.output_files import refuse_recording_path, write_atomically
 from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog

@@ -15,8 +15,8 @@ from rich.table import Table
 from rich.text import Text
 
 from logs.recording.attachments import make_layout_text
-from logs.recording.disk import FileKind, detect_kind
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
+from logs.recording.file_kind import FileKind, detect_kind
 from logs.recording.file_scan import RecordedMessage
 from logs.recording.foreign import read_foreign_flight
 from logs.recording.info import PositionLoss, RecordingInfo

@@ -14,10 +14,11 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import FileKind, refuse_recording_path, write_atomically
+from logs.recording.file_kind import FileKind
 from logs.recording.flight import FlightData
 from logs.recording.foreign import read_foreign_flight
 from logs.recording.mavlink_flight import MavlinkFlight, list_facts
+from logs.recording.output_files import refuse_recording_path, write_atomically
 from logs.recording.reader import explain_missing_end, read
 from logs.recording.summary import make_summary_table, make_value_table, summarise
 from logs.recording.ulog import is_ulog

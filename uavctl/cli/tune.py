@@ -17,8 +17,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
+from logs.recording.output_files import write_atomically
 from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.summary import summarise
 from uavctl.build.controller import build_flight_design

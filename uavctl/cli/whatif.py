@@ -15,12 +15,13 @@ from rich.console import Group, RenderableType
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
-from logs.recording.disk import FileKind, detect_kind, write_atomically
 from logs.recording.ends import create_recording, put_header
 from logs.recording.export import count_messages
+from logs.recording.file_kind import FileKind, detect_kind
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
 from logs.recording.notes import RecorderNote
+from logs.recording.output_files import write_atomically
 from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.summary import count, summarise

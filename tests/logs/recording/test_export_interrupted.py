@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
-from logs.recording.disk import remove_on_error
 from logs.recording.export import TableFormat, Watch, export_tables
 from logs.recording.file_scan import RecordedMessage
+from logs.recording.output_files import remove_on_error
 from logs.recording.reader import read_messages
 from logs.recording.tlog import export_tlog
 from uavctl.errors import RecordingError

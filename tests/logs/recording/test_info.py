@@ -9,7 +9,8 @@ from recording_fakes import HEADER, Clock, record_flight, stored_byte, write_two
 from rich.console import Console
 from view_rig import record
 
-from logs.recording.disk import MAGIC, check_free_space
+from logs.recording.disk import check_free_space
+from logs.recording.file_kind import MAGIC
 from logs.recording.info import RecordingInfo, read_info
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import read, read_header

@@ -16,7 +16,8 @@ from mcap.reader import make_reader
 from recording_fakes import HEADER, Clock, Disk, Item, drop_recorder_notes, flight
 
 from logs.recording.derived_topics import LOG
-from logs.recording.disk import MAGIC, DiskFile, FreeSpaceMonitor
+from logs.recording.disk import DiskFile, FreeSpaceMonitor
+from logs.recording.file_kind import MAGIC
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import find_segments, read, read_header, read_kind

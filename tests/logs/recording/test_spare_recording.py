@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from loopback_rig import lockstep
 
-from logs.recording.disk import MAGIC, refuse_recording_path
+from logs.recording.file_kind import MAGIC
+from logs.recording.output_files import refuse_recording_path
 from logs.recording.reader import explain_missing_end
 from logs.recording.recorder import SyncRecorder
 from uavctl.cli.app import run
