@@ -273,7 +273,7 @@ def ignore_progress(messages: Iterable[RecordedMessage], _total: int | None, _wh
 
 
 def count_messages(flight: Path) -> int | None:
-    """Return how many messages `good_messages` will yield, by the recording's statistics; None if it is torn.
+    """Return how many messages `read_messages` will yield, by the recording's statistics; None if it is torn.
 
     Raises:
         RecordingError: There is no such recording.
