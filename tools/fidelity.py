@@ -30,7 +30,8 @@ from uavctl.errors import UavctlError
 from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
 from uavctl.lab.identify.result import Identified, identify
 from uavctl.lab.position_loop import EXTERNAL_ONLY
-from uavctl.loop import VEHICLE, ControlLoop
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import VEHICLE
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Datagram, Order, Record
 

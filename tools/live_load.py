@@ -33,7 +33,7 @@ from live_rig import HANDSHAKE, make_frame, make_head
 from places import without_pages
 
 from logs.live.process import LiveProcess
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from uavctl.clock import monotonic_ns
 from uavctl.records import Decision, Timing
 
@@ -193,8 +193,8 @@ def summarise(path: Path, kind: str, phases: list[Phase]) -> dict[str, float | s
     def is_inside(at_ns: int) -> bool:
         return any(name == kind and begin_ns <= at_ns < end_ns for name, begin_ns, end_ns in phases)
 
-    decisions = [one for one in records(path, Decision) if is_inside(one.at_ns)]
-    late_ms = np.array([one.lateness_ns for one in records(path, Timing) if is_inside(one.at_ns)]) * 1e-6
+    decisions = [one for one in read_kind(path, Decision) if is_inside(one.at_ns)]
+    late_ms = np.array([one.lateness_ns for one in read_kind(path, Timing) if is_inside(one.at_ns)]) * 1e-6
     return {
         "clients": kind,
         "ticks": len(decisions),

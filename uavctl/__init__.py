@@ -11,9 +11,9 @@ __version__ = "0.2.0"
 _MODULES = {
     "Config": "uavctl.config",
     "Flight": "uavctl.api.flights",
-    "Plan": "uavctl.api.control",
     "Recording": "uavctl.api.flights",
     "Runs": "uavctl.api.control",
+    "SolvedPlan": "uavctl.api.control",
     "SteppedController": "uavctl.api.control",
     "controller": "uavctl.api.control",
     "fly": "uavctl.api.flights",

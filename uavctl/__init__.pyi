@@ -1,5 +1,5 @@
-from uavctl.api.control import Plan as Plan
 from uavctl.api.control import Runs as Runs
+from uavctl.api.control import SolvedPlan as SolvedPlan
 from uavctl.api.control import SteppedController as SteppedController
 from uavctl.api.control import controller as controller
 from uavctl.api.control import link as link

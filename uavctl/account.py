@@ -81,7 +81,7 @@ class FlightAccount:
         ends_in_flight: The flight is to end in the air, as simulated flights do.
         goal: The place to be reached, in words; empty without one.
         has_arrived: The place has been reached.
-        release_reason: Why a monitor has released the vehicle; empty while none has.
+        breach_reason: Why the envelope has let the vehicle go; empty while it has not.
         was_controlled: The controller has been in charge at a Δt boundary.
         was_engaged: The vehicle has been flown by our setpoints.
         is_over: Nothing more will be sent.

@@ -24,7 +24,7 @@ class EventCode(StrEnum):
     HOLD = "fallback-hold"
     LAND = "fallback-land"
     STOPPED = "stopped"
-    # Release of the vehicle: its positions or its motion cannot be right
+    # The vehicle is let go: its positions or its motion cannot be right
     OUTSIDE = "envelope-outside"  # the estimate is outside the room
     RESPONSE = "envelope-response"  # positions show an acceleration that nothing explains
     VELOCITY = "envelope-velocity"  # positions move otherwise than the vehicle says

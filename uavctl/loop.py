@@ -11,13 +11,13 @@ fails, or whole ticks do, a landing request of its own is sent until it is answe
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from traceback import extract_tb
 
 from msgspec.structs import replace
 
 from uavctl.account import FlightAccount
+from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
 from uavctl.config import Config
 from uavctl.errors import TickOverdueError, in_words
@@ -26,13 +26,14 @@ from uavctl.flight.controller import Controller
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
-from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
+from uavctl.inbox import Inbox
+from uavctl.mavlink.connection import OVERRUN, VEHICLE, make_links
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
 from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
 from uavctl.mavlink.landing import LandingRequest, LandingTarget
-from uavctl.mavlink.messages import CommandAck, Message, StatusText
-from uavctl.mavlink.relay import Relay
+from uavctl.mavlink.messages import CommandAck, StatusText
+from uavctl.mavlink.relay import Relay, describe_relay
 from uavctl.records import (
     Command,
     ControlMode,
@@ -64,13 +65,7 @@ from uavctl.records import (
 )
 from uavctl.smpc.plant import Plant
 
-ReceivedItem = PositionSample | VehicleStatus | VehicleMotion | InertialSample | CommandAck | StatusText
-
-VEHICLE = "vehicle"
-MOCAP = "mocap"
-SECOND_NS = 1_000_000_000
 CONTROL_FAILED_TEXT = "the controller has failed:"  # then the error
-MAX_ORDERS = 16  # that wait for a tick
 CONSOLE_CODES = frozenset(
     {
         EventCode.VEHICLE_TEXT,
@@ -89,34 +84,6 @@ CONSOLE_CODES = frozenset(
 FROZEN_TEXT = "the camera repeats its position although the vehicle moves; its positions count as lost"
 FROZEN_PAUSE_NS = 3_000_000_000  # without frozen positions: the next ones are a new series
 INCONSISTENT_HOLD_NS = 3_000_000_000  # time in which positions are held back after such a contradiction
-MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
-MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
-
-
-def make_links(
-    config: Config, on_message: Callable[[Message, int], None] | None = None
-) -> dict[str, MavlinkConnection]:
-    """Make the connections' protocol states: one for both roles when the two URLs are the same.
-
-    Args:
-        on_message: Called with each decoded message of others, and its time [ns].
-    """
-    shared = config.daemon.vehicle == config.daemon.mocap
-    names = {VEHICLE: (VEHICLE, MOCAP)} if shared else {VEHICLE: (VEHICLE,), MOCAP: (MOCAP,)}
-    return {
-        name: MavlinkConnection(
-            name,
-            roles=frozenset(roles),
-            daemon=config.daemon,
-            frame=config.frame,
-            clock=config.clock,
-            source=config.source,
-            estimator=config.estimator,
-            on_message=on_message,
-            vehicle_time=config.relay.enabled and config.relay.vehicle_time,
-        )
-        for name, roles in names.items()
-    }
 
 
 class ControlLoop:
@@ -136,18 +103,16 @@ class ControlLoop:
         self._handover_config = config.hand_over
         self._vehicle_messages: tuple[CommandAck | StatusText, ...] = ()
         self._state = make_initial_state()
-        self._inbox: deque[tuple[int, ReceivedItem]] = deque()
+        self._inbox = Inbox()
         self._uses_inertial = config.estimator.inertial_std_mps2 > 0.0
-        self._inertial: tuple[InertialSample, ...] = ()
         self._next_stats_ns: int | None = None
         self._messages_lost_ns: int | None = None  # time since which the vehicle's messages may have been lost unread
         self._vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
         self._decision: Decision | None = None
-        self._orders: deque[Command] = deque()
         self._external_solve_ns = 0  # time that a controller of another package took in the last tick
-        # Last time at which positions contradicted the vehicle's climb or landing; None before.
         self._frozen_ns: int | None = None  # the last tick with frozen positions
+        # The last tick in which positions contradicted the vehicle's climb or landing
         self._position_inconsistent_ns: int | None = None
         # Not even the hand-over works any more: positions and a landing request are all that is sent.
         self._is_handover_failed = False
@@ -160,19 +125,9 @@ class ControlLoop:
     @property
     def ending(self) -> Ending:
         """Ending of the flight, or the one that it would have now."""
-        return replace(self.account.compute_ending(is_over=self.finished), relay=self._describe_relay())
-
-    def _describe_relay(self) -> str:
-        """Describe the positions passed on to the vehicle; empty where none are relayed."""
         stats = self.relay
-        if stats is None or stats.last_ns is None:
-            return "" if stats is None else "no position was passed on to the vehicle"
-        since_last_s = (stats.at_ns - stats.last_ns) * 1e-9
-        kept_count = sum(stats.kept.values())
-        text = f"passed on {stats.sent} positions and kept {kept_count} back"
-        text += f", the last one {since_last_s:.1f} s before the end"
-        after_setpoints_s = 0.0 if self._last_setpoint_ns is None else (stats.last_ns - self._last_setpoint_ns) * 1e-9
-        return f"{text}, {after_setpoints_s:.1f} s after the last setpoint" if after_setpoints_s > 0.0 else text
+        relay_text = "" if stats is None else describe_relay(stats, self._last_setpoint_ns)
+        return replace(self.account.compute_ending(is_over=self.finished), relay=relay_text)
 
     @property
     def finished(self) -> bool:
@@ -194,19 +149,9 @@ class ControlLoop:
         """Counts of the positions passed on to the vehicle; None where none are passed on."""
         if not self._is_relay_enabled:
             return None
-        kept_counts = {reason: count for reason, count in self._relay.kept.items() if count}
         at_ns = 0 if self._decision is None else self._decision.at_ns
         has_control_ended = self._last_setpoint_ns is not None and self._last_setpoint_ns < at_ns
-        relay = self._relay
-        return RelayStats(
-            at_ns=at_ns,
-            sent=relay.sent,
-            kept=kept_counts,
-            last_ns=relay.last_ns,
-            alone=bool(self.account.control_error) or has_control_ended,
-            silent_for=relay.silent_for,
-            attitude_fault=relay.attitude_fault,
-        )
+        return self._relay.stats(at_ns, alone=bool(self.account.control_error) or has_control_ended)
 
     @property
     def inertial(self) -> tuple[int, int] | None:
@@ -225,7 +170,7 @@ class ControlLoop:
 
     @property
     def breach_reason(self) -> str:
-        """Reason why a monitor has released the vehicle; empty while none has."""
+        """Reason why the envelope has let the vehicle go; empty while it has not."""
         return "" if self._state.monitors.breach is None else self._state.monitors.breach.text
 
     @property
@@ -260,7 +205,7 @@ class ControlLoop:
                 self._put("/uavctl/event", at_ns, item)
                 console_events = (*console_events, item) if item.code in CONSOLE_CODES else console_events
             elif self._uses_inertial or not isinstance(item, InertialSample):
-                self._inbox.append((at_ns, item))
+                self._inbox.add(item, at_ns)
             if isinstance(item, PositionSample):
                 from_source = received.is_source_settled
                 if self._is_relay_enabled:
@@ -269,8 +214,8 @@ class ControlLoop:
         answers = tuple([self._record_outgoing(link, answer, at_ns) for answer in replies]) if replies else ()
         return Received(answers, from_vehicle, from_source, console_events)
 
-    def refused(self, link: str, counts: dict[str, int], at_ns: int) -> tuple[Event, ...]:
-        """Note that a connection has dropped datagrams unread; return its events for the console.
+    def add_refusals(self, link: str, counts: dict[str, int], at_ns: int) -> tuple[Event, ...]:
+        """Add counts of datagrams that a connection has dropped unread; return its events for the console.
 
         A dropped message of the vehicle may have reported that the pilot took over. So nothing that moves the vehicle
         is sent until its next heartbeat.
@@ -319,7 +264,7 @@ class ControlLoop:
             link=output.link,
             vehicle=self._vehicle,
             answers=answers,
-            news=tuple([event for event in output.events if event.code in CONSOLE_CODES]),
+            console_events=tuple([event for event in output.events if event.code in CONSOLE_CODES]),
             notices=tuple(notices),
             step_ns=step_ns,
         )
@@ -335,7 +280,7 @@ class ControlLoop:
     def _relay_positions(self, inputs: StepInput, output: TickOutput, send: Send, notices: list[Event]) -> None:
         """Pass positions on to the vehicle, but those that contradict its climb or landing."""
         at_ns = inputs.at_ns
-        if output.position_inconsistent and self._hand_over.has_begun:
+        if output.position_inconsistent and self._hand_over.is_climbing_or_landing:
             self._position_inconsistent_ns = at_ns
         if not self._is_relay_enabled:
             return
@@ -384,7 +329,7 @@ class ControlLoop:
         if not self.account.control_error:
             try:
                 self._state, output = run_tick(
-                    self._state, inputs, self._controller, is_climbing_or_landing=self._hand_over.has_begun
+                    self._state, inputs, self._controller, is_climbing_or_landing=self._hand_over.is_climbing_or_landing
                 )
             except (Exception, TickOverdueError) as error:  # noqa: BLE001 the vehicle may fly by relayed positions
                 notices.append(self._fail_core(_describe_error(error), inputs.at_ns))
@@ -490,9 +435,8 @@ class ControlLoop:
 
     def order(self, command: Command) -> bool:
         """Queue an order of the operator for the next tick; False if too many wait already."""
-        if len(self._orders) >= MAX_ORDERS:
+        if not self._inbox.add_order(command):
             return False
-        self._orders.append(command)
         self.account.takes_off = self.account.takes_off or command.order is Order.TAKE_OFF
         return True
 
@@ -501,7 +445,7 @@ class ControlLoop:
         """Name of the controller of another package that plans; empty where one of ours does."""
         return self._controller.outside
 
-    def answered(self, took_ns: int) -> None:
+    def note_solve_time(self, took_ns: int) -> None:
         """Note the time that a controller of another package took for its last plan; the next tick judges it."""
         self._external_solve_ns = took_ns
 
@@ -510,7 +454,7 @@ class ControlLoop:
         is_move = order in (Order.GOTO, Order.HOLD, Order.RESUME)
         return explain_move_refusal(self.handover_state, self._vehicle) if is_move else ""
 
-    def timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
+    def record_timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
         """Record the times that the shell measured around a tick."""
         estimate, at_ns = ticked.estimate, ticked.decision.at_ns
         self._put(
@@ -528,53 +472,30 @@ class ControlLoop:
 
     def _gather_inputs(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
         """Gather the inputs of the tick. They are recorded first, so that a replay knows when the tick ran."""
-        samples, statuses, self._vehicle_messages = self._take_due_messages(at_ns)
+        arrivals = self._inbox.take(at_ns)
+        self._vehicle_messages = arrivals.messages
+        self._motion = self._motion if arrivals.motion is None else arrivals.motion
+        self._update_vehicle(arrivals.statuses)
         inputs = StepInput(
             tick=tick,
             at_ns=at_ns,
-            samples=samples,
+            samples=arrivals.samples,
             vehicle=self._hand_over.select_controlled_status(at_ns, self._vehicle),
             motion=self._motion,
-            inertial=self._inertial,
+            inertial=arrivals.inertial,
             missed_ticks=missed_ticks,
             stop=stop,
-            commands=tuple(self._orders),
+            commands=arrivals.orders,
             answered_ns=self._external_solve_ns,
         )
-        self._orders.clear()
         self._external_solve_ns = 0
         self._put("/uavctl/step_input", at_ns, inputs)
-        for status in statuses:
+        for status in arrivals.statuses:
             self._put("/uavctl/vehicle", status.at_ns, status)
         return inputs
 
-    def _take_due_messages(
-        self, at_ns: int
-    ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[CommandAck | StatusText, ...]]:
-        """Take the samples that arrived up to `at_ns`, and all other messages of the vehicle.
-
-        Its messages count even if they came after the time of a late tick: they may report that the pilot flies. A
-        later status of the same batch does not hide that.
-        """
-        samples: list[PositionSample] = []
-        statuses: list[VehicleStatus] = []
-        messages: list[CommandAck | StatusText] = []
-        inertial: list[InertialSample] = []
-        later_items: deque[tuple[int, ReceivedItem]] = deque()
-        for received_ns, item in self._inbox:
-            if isinstance(item, VehicleStatus):
-                statuses.append(item)
-            elif isinstance(item, VehicleMotion):
-                self._motion = item
-            elif not isinstance(item, PositionSample | InertialSample):
-                messages.append(item)
-            elif received_ns <= at_ns and isinstance(item, InertialSample):
-                inertial.append(item)
-            elif received_ns <= at_ns and isinstance(item, PositionSample):
-                samples.append(item)
-            else:
-                later_items.append((received_ns, item))
-        self._inbox, self._inertial = later_items, tuple(inertial[-MAX_INERTIAL:])
+    def _update_vehicle(self, statuses: Sequence[VehicleStatus]) -> None:
+        """Take the vehicle's new statuses. A later one does not hide that it has left the external mode."""
         flown = self._hand_over.state is HandoverState.ENGAGED
         left_statuses = [status for status in statuses if flown and self._hand_over.has_left_external_mode(status)]
         # The newest status with the mode that it left for counts: it may have the reason of the change.
@@ -585,7 +506,6 @@ class ControlLoop:
             self._landing_request.prepare(address, self._vehicle.autopilot)
         if statuses and self._messages_lost_ns is not None and statuses[-1].at_ns > self._messages_lost_ns:
             self._messages_lost_ns = None
-        return _select_newest(samples), tuple(statuses), tuple(messages)
 
     def _record_output(self, output: TickOutput, at_ns: int) -> None:
         if output.estimate is not None:
@@ -696,19 +616,6 @@ def _describe_error(error: BaseException) -> str:
     last = next(reversed(extract_tb(error.__traceback__)), None)
     where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
     return f"{in_words(error)}{where}"
-
-
-def _select_newest(samples: list[PositionSample]) -> tuple[PositionSample, ...]:
-    """Return at most `MAX_SAMPLES` samples, in order; a source that sends many displaces none of another source."""
-    if len(samples) <= MAX_SAMPLES:
-        return tuple(samples)
-    newer_counts: Counter[str] = Counter()  # newer samples of the same source
-    ranks = [0] * len(samples)
-    for index in range(len(samples) - 1, -1, -1):
-        ranks[index] = newer_counts[samples[index].source]
-        newer_counts[samples[index].source] += 1
-    newest_indices = sorted(range(len(samples)), key=lambda index: (ranks[index], -index))[:MAX_SAMPLES]
-    return tuple(samples[index] for index in sorted(newest_indices))
 
 
 def _pair_answers(

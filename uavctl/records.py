@@ -457,7 +457,7 @@ class Received(NamedTuple):
     answers: tuple[Outgoing, ...]  # to requests for our time
     from_vehicle: bool  # it came from the vehicle that is flown, not from others on the same port
     from_source: bool  # it held a position of a source that has spoken for a while
-    news: tuple[Event, ...] = ()  # that it brought, for a person
+    console_events: tuple[Event, ...] = ()  # events that it brought, for a person
 
 
 class Ticked(msgspec.Struct, frozen=True, kw_only=True):
@@ -468,8 +468,9 @@ class Ticked(msgspec.Struct, frozen=True, kw_only=True):
     link: LinkEstimate | None  # at boundaries that were not missed
     vehicle: VehicleStatus | None  # newest state that the vehicle has told; None before the first
     answers: tuple[tuple[Command, Event], ...]  # the orders that the tick took, each with its answer
-    news: tuple[Event, ...]  # of the core, for a person
-    notices: tuple[Event, ...]  # of the hand-over, for a person; and that the controller has failed
+    console_events: tuple[Event, ...]  # of the core, for a person; a console shows repeated ones seldom
+    # For a person, each to be shown: of the hand-over and the relay, of frozen positions and a failed controller
+    notices: tuple[Event, ...]
     step_ns: int  # time that the core took, by the stopwatch
 
 

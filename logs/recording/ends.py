@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from logs.recording.disk import check_free_space, remove_empty_folders
+from logs.recording.disk import check_free_space
+from logs.recording.output_files import remove_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER
 from uavctl.account import report_lost_records

@@ -27,8 +27,9 @@ from urllib.parse import quote
 
 import msgspec
 
-from logs.recording.disk import refuse_existing_files, remove_on_error, write_temporary_files
-from logs.recording.reader import RecordedMessage, count_by_topic, good_messages, lacks_end, segment_files
+from logs.recording.file_scan import RecordedMessage, count_by_topic
+from logs.recording.output_files import refuse_existing_files, remove_on_error, write_temporary_files
+from logs.recording.reader import explain_missing_end, find_segments, read_messages
 from logs.recording.topics import HEADER, LIBRARY, decode, get_record_type, is_known, is_view
 from uavctl.config.load import find_nearest
 from uavctl.errors import RecordingError, need
@@ -272,15 +273,15 @@ def ignore_progress(messages: Iterable[RecordedMessage], _total: int | None, _wh
 
 
 def count_messages(flight: Path) -> int | None:
-    """Return how many messages `good_messages` will yield, by the recording's statistics; None if it is torn.
+    """Return how many messages `read_messages` will yield, by the recording's statistics; None if it is torn.
 
     Raises:
         RecordingError: There is no such recording.
     """
-    if lacks_end(flight):
+    if explain_missing_end(flight):
         return None
     number = 0
-    for index, path in enumerate(segment_files(flight)):
+    for index, path in enumerate(find_segments(flight)):
         left_out = {HEADER, LIBRARY} if index else set()  # which later files repeat
         counts = count_by_topic(path)
         if counts is None:
@@ -313,7 +314,7 @@ def export_tables(
     rows: Counter[str] = Counter()
     with remove_on_error(targets), write_temporary_files(targets) as parts, ExitStack() as stack:
         writers = {name: stack.enter_context(begin(parts[files[name]], columns[name])) for name in columns}
-        for topic, at_ns, record in _decode_messages(watch(good_messages(flight), total, "writing")):
+        for topic, at_ns, record in _decode_messages(watch(read_messages(flight), total, "writing")):
             for name, row in tables.rows(topic, at_ns, record):
                 writers[name](row)
                 rows[name] += 1
@@ -338,7 +339,7 @@ def _find_columns(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int
 
     def counted() -> Iterator[RecordedMessage]:
         nonlocal total
-        for message in good_messages(flight):
+        for message in read_messages(flight):
             total += 1
             tables.zero_utc_ns = message.zero_utc_ns
             if not is_known(message.definition.topic):
@@ -453,7 +454,7 @@ def list_tables(flight: Path) -> tuple[str, ...]:
     Raises:
         RecordingError: It cannot be read.
     """
-    topics = {message.definition.topic for message in good_messages(flight)}
+    topics = {message.definition.topic for message in read_messages(flight)}
     known_topics = sorted(filter(is_known, topics))
     return tuple(
         name
@@ -474,7 +475,7 @@ def read_table(flight: Path, name: str) -> pa.Table:
     tables = Tables()
     records: list[tuple[int, Record]] = []
     first_ns = None
-    for message in good_messages(flight):
+    for message in read_messages(flight):
         first_ns = message.at_ns if first_ns is None else first_ns
         tables.zero_utc_ns = message.zero_utc_ns
         if message.definition.topic == topic and is_known(topic):

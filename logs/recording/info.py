@@ -11,9 +11,10 @@ from pathlib import Path
 import msgspec
 
 from logs.recording.design_view import get_config_name
+from logs.recording.file_scan import AttachedFile, Damage, EndOfFile, RecordedMessage
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader, VehicleParameter
-from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, segment_files, walk
+from logs.recording.reader import find_segments, scan_recording
 from logs.recording.topics import HEADER, LIBRARY, PARAMETER, RECORDER, decode, parse_raw_topic
 from uavctl.errors import RecordingError
 from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
@@ -242,9 +243,9 @@ def read_info(path: Path) -> RecordingInfo:
     newest: dict[str, RecordedMessage] = {}
     attachments: dict[str, AttachmentInfo] = {}  # each file of the recording has them, the last one all
     parameters = ParameterReader()
-    segments = [_Segment(file) for file in segment_files(path)]
+    segments = [_Segment(file) for file in find_segments(path)]
     ended = 0
-    for item in walk(path):
+    for item in scan_recording(path):
         if isinstance(item, Damage):
             damage.append(str(item))
             continue

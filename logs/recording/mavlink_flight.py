@@ -51,7 +51,7 @@ _OWN = ("LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "GPS_RAW_INT")
 _GLOBAL_LAYOUT = MessageLayout(mavlink.MAVLink_global_position_int_message)
 _EARTH_M = 6_371_000.8  # mean radius
 _WINDOW_NS, _AHEAD_NS = 10_000_000_000, 20_000_000  # of a source's clock, as the daemon judges it
-_LARGEST_V = 1000.0  # of a battery that flies; beyond, it is no voltage
+_MAX_BATTERY_V = 1000.0  # of a battery that flies; beyond, it is no voltage
 _AXES = {"ned": (1, 1, 1), "flu": (1, -1, -1)}
 
 
@@ -163,10 +163,10 @@ def read_flight(path: Path, system: int | None = None) -> MavlinkFlight:
         RecordingError: The file cannot be read, holds no packet, or none that says anything.
         UsageError: There is nothing of that system.
     """
-    return flight_in(read_tlog(path), str(path), system)
+    return make_flight(read_tlog(path), str(path), system)
 
 
-def flight_in(log: Tlog, name: str, system: int | None = None) -> MavlinkFlight:
+def make_flight(log: Tlog, name: str, system: int | None = None) -> MavlinkFlight:
     """Return the flight in some packets.
 
     Args:
@@ -283,9 +283,9 @@ class _Reader:
                 track.append((at_ns, message.position_m, message.velocity_mps))
             case Position(local_ned=False) if not self._is_another(message.system):
                 name = f"{message.name} of system {message.system}"
-                position_m = _ned(message, message.position_m)
+                position_m = _turn_to_ned(message, message.position_m)
                 self._sources.setdefault(name, SentSource()).take(
-                    position_m, _velocity(message), message.stamp_us, at_ns
+                    position_m, _read_velocity(message), message.stamp_us, at_ns
                 )
             case StatusText() if is_vehicle:
                 self._take_text(message, at_ns)
@@ -293,7 +293,7 @@ class _Reader:
                 self._attitudes.setdefault(message.quaternion, []).append((at_ns, message.angles_rad))
             # An autopilot without a battery's sensor sends 0 V from the start; a battery may fall to it.
             case Battery(voltage_v=float(voltage_v)) if is_vehicle and (voltage_v > 0 or self._battery):
-                if voltage_v < _LARGEST_V:
+                if voltage_v < _MAX_BATTERY_V:
                     self._battery.append((at_ns, voltage_v))
 
     @property
@@ -350,7 +350,7 @@ class _Reader:
         """Take a place on the globe, in 1e-7 degrees, as north and east of the first one."""
         lat_deg, lon_deg = lat * 1e-7, lon * 1e-7
         self._home_deg = self._home_deg or (lat_deg, lon_deg)
-        north_m, east_m = from_home(lat_deg, lon_deg, self._home_deg)
+        north_m, east_m = compute_offset_m(lat_deg, lon_deg, self._home_deg)
         self._vehicle_positions.setdefault(name, []).append((at_ns, (north_m, east_m, down_m), velocity))
 
     def _take_odometry(self, frame: bytes, at_ns: int) -> None:
@@ -368,7 +368,7 @@ class _Reader:
         beat, attitudes = self._beat, self._attitudes.get(False, self._attitudes.get(True, []))
         own_source = next((own_name for own_name in _OWN if own_name in self._vehicle_positions), "")
         sources = dict(sorted(self._sources.items(), key=lambda item: -len(item[1].track)))
-        ages = {source: ages_of(sent, self._origin_ns) for source, sent in sources.items()}
+        ages = {source: make_ages(sent, self._origin_ns) for source, sent in sources.items()}
         setpoints = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
         begin = datetime.fromtimestamp(self._origin_ns // 1_000_000 / 1000, UTC)
         info = MavlinkFlightInfo(
@@ -379,7 +379,7 @@ class _Reader:
             vehicle_system=None if beat is None else beat.system,
             own_positions=len(self._vehicle_positions.get(own_source, ())),
             own_source=own_source,
-            sent=tuple(figures_of(source, sent, ages[source]) for source, sent in sources.items()),
+            sent=tuple(make_source_figures(source, sent, ages[source]) for source, sent in sources.items()),
             setpoints=len(setpoints),
             modes=tuple(self._modes),
             texts=tuple(self._texts),
@@ -396,28 +396,28 @@ class _Reader:
         )
         flight = MavlinkFlight(
             info=info,
-            own=track_of(self._vehicle_positions.get(own_source, ()), self._origin_ns),
-            sent={source: track_of(sent.track, self._origin_ns) for source, sent in sources.items()},
+            own=make_track(self._vehicle_positions.get(own_source, ()), self._origin_ns),
+            sent={source: make_track(sent.track, self._origin_ns) for source, sent in sources.items()},
             ages=ages,
-            setpoint_t_s=seconds((at_ns for at_ns, _ in self._setpoints), self._origin_ns),
+            setpoint_t_s=compute_times_s((at_ns for at_ns, _ in self._setpoints), self._origin_ns),
             setpoint_m=setpoints[:, :3],
             setpoint_mps=setpoints[:, 3:6],
             setpoint_mps2=setpoints[:, 6:],
-            attitude_t_s=seconds((at_ns for at_ns, _ in attitudes), self._origin_ns),
+            attitude_t_s=compute_times_s((at_ns for at_ns, _ in attitudes), self._origin_ns),
             attitude_deg=np.degrees(np.array([angles for _, angles in attitudes], dtype=np.float64).reshape(-1, 3)),
-            height_t_s=seconds((at_ns for at_ns, _ in self._height), self._origin_ns),
+            height_t_s=compute_times_s((at_ns for at_ns, _ in self._height), self._origin_ns),
             height_m=np.array([height_m for _, height_m in self._height], dtype=np.float64),
-            beat_t_s=seconds(self._beats_ns, self._origin_ns),
-            battery_t_s=seconds((at_ns for at_ns, _ in self._battery), self._origin_ns),
+            beat_t_s=compute_times_s(self._beats_ns, self._origin_ns),
+            battery_t_s=compute_times_s((at_ns for at_ns, _ in self._battery), self._origin_ns),
             battery_v=np.array([voltage_v for _, voltage_v in self._battery], dtype=np.float64),
         )
-        return with_parts(flight)
+        return name_missing_parts(flight)
 
     def _second(self, at_ns: int) -> float:
         return (at_ns - self._origin_ns) * 1e-9
 
 
-def with_parts(flight: MavlinkFlight) -> MavlinkFlight:
+def name_missing_parts(flight: MavlinkFlight) -> MavlinkFlight:
     """Return a flight that names the parts which are not in its recording."""
     info = flight.info
     parts: dict[str, Sized] = {
@@ -435,28 +435,28 @@ def with_parts(flight: MavlinkFlight) -> MavlinkFlight:
     return replace(flight, info=msgspec.structs.replace(info, battery_v=battery_v, missing=missing))
 
 
-def from_home(lat_deg: float, lon_deg: float, home_deg: tuple[float, float]) -> tuple[float, float]:
+def compute_offset_m(lat_deg: float, lon_deg: float, home_deg: tuple[float, float]) -> tuple[float, float]:
     """Return how far north and east of a first place another one is [m]; its surroundings count as flat."""
     north_m = math.radians(lat_deg - home_deg[0]) * _EARTH_M
     return north_m, math.radians(lon_deg - home_deg[1]) * _EARTH_M * math.cos(math.radians(home_deg[0]))
 
 
-def seconds(at_ns: Iterable[int], origin_ns: int) -> Array:
+def compute_times_s(at_ns: Iterable[int], origin_ns: int) -> Array:
     """Return times from the origin on [s]."""
     return np.array([(at - origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
 
-def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) -> PositionTrack:
+def make_track(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) -> PositionTrack:
     """Return places and speeds as arrays."""
     unknown = (math.nan, math.nan, math.nan)
     return PositionTrack(
-        seconds((at_ns for at_ns, _, _ in points), origin_ns),
+        compute_times_s((at_ns for at_ns, _, _ in points), origin_ns),
         np.array([position_m for _, position_m, _ in points], dtype=np.float64).reshape(-1, 3),
         np.array([velocity or unknown for _, _, velocity in points], dtype=np.float64).reshape(-1, 3),
     )
 
 
-def ages_of(source: SentSource, origin_ns: int) -> Ages:
+def make_ages(source: SentSource, origin_ns: int) -> Ages:
     """Return the ages of a source's positions."""
     at_ns = [captured for captured, _, _ in source.track]
     delay_s, age_at_ns, age_s = [], [], []
@@ -470,10 +470,11 @@ def ages_of(source: SentSource, origin_ns: int) -> Ages:
                 age_at_ns.append(at)
                 age_s.append((at - known_ns) * 1e-9)
                 newest_ns = known_ns
-    return Ages(seconds(at_ns, origin_ns), np.array(delay_s), seconds(age_at_ns, origin_ns), np.array(age_s))
+    times_s, age_times_s = compute_times_s(at_ns, origin_ns), compute_times_s(age_at_ns, origin_ns)
+    return Ages(times_s, np.array(delay_s), age_times_s, np.array(age_s))
 
 
-def figures_of(name: str, source: SentSource, ages: Ages) -> SentPositions:
+def make_source_figures(name: str, source: SentSource, ages: Ages) -> SentPositions:
     """Return the figures of a source."""
     span_s = float(ages.t_s[-1] - ages.t_s[0])
     delays_ms = 1e3 * ages.delay_s[np.isfinite(ages.delay_s)]
@@ -493,7 +494,7 @@ def figures_of(name: str, source: SentSource, ages: Ages) -> SentPositions:
     )
 
 
-def _ned(position: Position, vector: Vec3) -> Vec3:
+def _turn_to_ned(position: Position, vector: Vec3) -> Vec3:
     """Return a vector of a position's axes in local NED; a message that declares none means NED."""
     x, y, z = vector
     if position.convention == "enu":
@@ -502,11 +503,11 @@ def _ned(position: Position, vector: Vec3) -> Vec3:
     return signs[0] * x, signs[1] * y, signs[2] * z
 
 
-def _velocity(position: Position) -> Vec3 | None:
-    return None if position.velocity_mps is None else _ned(position, position.velocity_mps)
+def _read_velocity(position: Position) -> Vec3 | None:
+    return None if position.velocity_mps is None else _turn_to_ned(position, position.velocity_mps)
 
 
-def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
+def list_facts(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     """Return names and values for a table, on a page or in a terminal."""
     yield "recording", info.recording
     yield "begins at", info.begin_utc or "unknown"
@@ -515,7 +516,8 @@ def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     positions_text = f"{info.own_positions} ({info.own_source})" if info.own_positions else "none"
     yield "positions of its own", positions_text
     for sent in info.sent:
-        yield f"positions, {sent.source}", f"{sent.positions}, {sent.rate_hz:.1f}/s; {longest_gap(sent)}{_delays(sent)}"
+        figures = f"{sent.positions}, {sent.rate_hz:.1f}/s; {format_longest_gap(sent)}{_format_delays(sent)}"
+        yield f"positions, {sent.source}", figures
     yield "setpoints in local NED", str(info.setpoints)
     yield "modes", ", ".join(dict.fromkeys(mode.mode for mode in info.modes)) or "none"
     yield "texts", str(len(info.texts))
@@ -534,17 +536,17 @@ def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
         yield "not in it", ", ".join(info.missing)
 
 
-def rate_of(info: MavlinkFlightInfo, message: str) -> str:
+def format_rate(info: MavlinkFlightInfo, message: str) -> str:
     """Return how often a message came, in words; empty if it came once."""
     return f"{info.rates_hz[message]:.3g}/s" if message in info.rates_hz else ""
 
 
-def longest_gap(sent: SentPositions) -> str:
+def format_longest_gap(sent: SentPositions) -> str:
     """Return the longest silence of a source in words."""
     return f"longest gap {sent.longest_gap_s:.2f} s"
 
 
-def _delays(sent: SentPositions) -> str:
+def _format_delays(sent: SentPositions) -> str:
     if sent.stamp_unit == StampUnit.CONSTANT:
         return "; stamps that do not go on"
     if sent.stamp_unit != StampUnit.MICROSECONDS:

@@ -35,7 +35,7 @@ _TYPES = {
 _NUMBERS = {name: number for number, name in _TYPES.items()}
 _INTEGERS = {"UINT8": "<B", "INT8": "<b", "UINT16": "<H", "INT16": "<h", "UINT32": "<I", "INT32": "<i"}
 _HASH = "_HASH_CHECK"  # PX4's checksum over all of them, told as one; any setting changes it
-_MOST = 20_000  # parameters kept: a vehicle has one or two thousand
+_MAX_PARAMETERS = 20_000  # parameters kept: a vehicle has one or two thousand
 
 
 class VehicleParameter(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,12 +76,12 @@ class ParameterReader:
         if datagram.link in self._partial_frames:
             data = self._partial_frames.pop(datagram.link) + data
         elif datagram.link not in self._lost:
-            at = _unread(data)
+            at = _find_frame(data)
         while at < len(data):
-            begin = _next_frame(data, at)
+            begin = _find_next_frame(data, at)
             if begin > at:
                 self._lost.add(datagram.link)
-            length = _length(data, begin)
+            length = _measure_frame(data, begin)
             if length is None or begin + length > len(data):
                 self._partial_frames[datagram.link] = data[begin:]
                 return
@@ -107,7 +107,7 @@ class ParameterReader:
                 self._autopilots.setdefault(fields.src_system, fields.autopilot)
             return
         key = fields.src_system, fields.src_component, decode_text(fields.param_id)
-        if key[2] != _HASH and (len(self._values) < _MOST or key in self._values):
+        if key[2] != _HASH and (len(self._values) < _MAX_PARAMETERS or key in self._values):
             self._values[key] = fields.param_value, fields.param_type
             self._counts[key[:2]] = fields.param_count
 
@@ -123,7 +123,7 @@ class ParameterReader:
         systems = [*self._autopilots, *(system for system, _, _ in self._values)]
         received = {
             name: VehicleParameter(
-                value=_value(value, kind, bytewise=self._autopilots.get(system) == mavlink.MAV_AUTOPILOT_PX4),
+                value=_read_value(value, kind, bytewise=self._autopilots.get(system) == mavlink.MAV_AUTOPILOT_PX4),
                 type=_TYPES.get(kind, str(kind)),
                 system=system,
                 component=component,
@@ -181,7 +181,7 @@ def _is_autopilot(item: tuple[tuple[int, int, str], object]) -> bool:
     return bool(item[0][1] == mavlink.MAV_COMP_ID_AUTOPILOT1)
 
 
-def _value(value: float, kind: int, *, bytewise: bool) -> int | float:
+def _read_value(value: float, kind: int, *, bytewise: bool) -> int | float:
     """Return the value of a parameter; of a single float the shortest digits that give it back."""
     form = _INTEGERS.get(_TYPES.get(kind, ""))
     if form is not None and bytewise:
@@ -191,7 +191,7 @@ def _value(value: float, kind: int, *, bytewise: bool) -> int | float:
     return float(str(np.float32(value)))
 
 
-def _unread(data: bytes) -> int:
+def _find_frame(data: bytes) -> int:
     """Return where the first frame begins that may tell something: most datagrams are whole frames that do not."""
     at, last = 0, len(data) - _HEAD_BYTES
     while at <= last and data[at] == _V2 and int.from_bytes(data[at + 7 : at + 10], "little") not in _LAYOUTS:
@@ -202,13 +202,13 @@ def _unread(data: bytes) -> int:
     return at
 
 
-def _next_frame(data: bytes, at: int) -> int:
+def _find_next_frame(data: bytes, at: int) -> int:
     """Return where the next frame may begin, from `at` on; the end if nowhere."""
     starts = [start for marker in (_V1, _V2) if (start := data.find(marker, at)) >= 0]
     return min(starts, default=len(data))
 
 
-def _length(data: bytes, at: int) -> int | None:
+def _measure_frame(data: bytes, at: int) -> int | None:
     """Return the length of the frame that begins at `at` [bytes]; None while too little of it is there."""
     if len(data) - at < _HEAD_BYTES:
         return None

@@ -9,9 +9,10 @@ import msgspec
 
 from logs.recording import attachments
 from logs.recording.disk import DiskFile
+from logs.recording.file_scan import AttachedFile, Damage, EndOfFile, RecordedMessage
 from logs.recording.notes import END_MISSING, MESSAGES_LOST, NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader
-from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, note_of, walk
+from logs.recording.reader import decode_note, scan_recording
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.topics import HEADER, PARAMETER, RECORDER, decode, encode, get_definition, parse_raw_topic
 from uavctl.errors import RecordingError
@@ -59,7 +60,7 @@ class _Tally:
         self._doubtful_bytes = 0  # without a gap nothing was in them: an index, or the file's head
         self._next = item.sequence + 1
         self.messages += not item.repeated
-        note = note_of(item)
+        note = decode_note(item)
         self.ended = note is not None and note.is_end
 
     def damaged(self, item: Damage) -> None:
@@ -111,7 +112,7 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
     segment: Segment | None = None
     has_header = False
     at_ns = zero_utc_ns = 0
-    for item in walk(src):
+    for item in scan_recording(src):
         if isinstance(item, Damage):
             tally.damaged(item)
         elif isinstance(item, EndOfFile):

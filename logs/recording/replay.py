@@ -154,69 +154,71 @@ class FieldNames:
     def meaning(self, topic: str, path: str) -> tuple[str, str]:
         """Return the meaning of a leaf, and its unit; either may be empty."""
         numbers = [int(text) for text in _NUMBER.findall(path)]
-        name = plain(path)
+        name = remove_indices(path)
         if not numbers:
-            return "", _unit(name)
+            return "", _get_unit(name)
         staged = f" in stage {numbers[0]}" if name in _STAGE and len(numbers) > 1 else ""
         for kind, known in ((_STATES, self._states), (_INPUTS, self._inputs)):
             if (topic, name) in kind and numbers[-1] < len(known):
                 meaning, unit = known[numbers[-1]]
                 return meaning + staged, unit
-        unit = _unit(name)
+        unit = _get_unit(name)
         return (AXES[numbers[-1]] if unit.startswith("m") and numbers[-1] < len(AXES) else ""), unit
 
 
-def plain(path: str) -> str:
+def remove_indices(path: str) -> str:
     """Return a path without the indices of entries."""
     return _NUMBER.sub("", path)
 
 
-def _unit(name: str) -> str:
+def _get_unit(name: str) -> str:
     return _UNITS.get(name.rpartition("_")[2], "") if "_" in name else ""
 
 
-def stage(topic: str) -> str:
+def name_stage(topic: str) -> str:
     """Return which stage of a tick is in question if this topic is the first to differ."""
     return _STAGES.get(topic, _SENT if parse_raw_topic(topic) is not None else "")
 
 
-def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
+def find_different_leaves(recorded: Record, replayed: Record) -> list[Leaf]:
     """Return the leaves in which two records of a topic differ in any bit."""
-    return list(unequal(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed)))
+    return list(iterate_different_leaves(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed)))
 
 
-def unequal(recorded: object, replayed: object, path: str = "") -> Iterator[Leaf]:
+def iterate_different_leaves(recorded: object, replayed: object, path: str = "") -> Iterator[Leaf]:
     """Leaves where two trees of plain values differ in any bit."""
     if isinstance(recorded, dict) and isinstance(replayed, dict):
         for key in dict.fromkeys([*recorded, *replayed]):
-            yield from unequal(recorded.get(key), replayed.get(key), f"{path}.{key}" if path else str(key))
+            yield from iterate_different_leaves(
+                recorded.get(key), replayed.get(key), f"{path}.{key}" if path else str(key)
+            )
     elif isinstance(recorded, list | tuple) and isinstance(replayed, list | tuple) and len(recorded) == len(replayed):
         for index, (value, other) in enumerate(zip(recorded, replayed, strict=True)):
-            yield from unequal(value, other, f"{path}[{index}]")
-    elif not _same_bits(recorded, replayed):
+            yield from iterate_different_leaves(value, other, f"{path}[{index}]")
+    elif not _have_same_bits(recorded, replayed):
         yield path, recorded, replayed
 
 
-def _same_bits(left: object, right: object) -> bool:
+def _have_same_bits(left: object, right: object) -> bool:
     if isinstance(left, float) and isinstance(right, float):
         return left.hex() == right.hex()
     return type(left) is type(right) and left == right
 
 
-def close(left: object, right: object, tolerance: float) -> bool:
+def are_close(left: object, right: object, tolerance: float) -> bool:
     """Return whether two leaves that differ count as the same: numbers, relative to the larger of 1 and their size."""
     if not isinstance(left, int | float) or not isinstance(right, int | float) or tolerance == 0.0:
         return False
     return math.isclose(left, right, rel_tol=tolerance, abs_tol=tolerance)
 
 
-def change(recorded: object, replayed: object) -> float | None:
+def compute_change(recorded: object, replayed: object) -> float | None:
     """Return the difference of two numbers; None of anything else."""
     numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (recorded, replayed))
     return float(replayed - recorded) if numbers else None  # type: ignore[operator]  # both are numbers
 
 
-def brief(record: Record | None) -> str:
+def describe_record(record: Record | None) -> str:
     """Return a record in a few words."""
     match record:
         case None:
@@ -229,7 +231,7 @@ def brief(record: Record | None) -> str:
             return f"a record ({type(record).__name__})"
 
 
-def chosen(record: Record | None) -> Chosen | None:
+def read_choice(record: Record | None) -> Chosen | None:
     """Return what a decision chose."""
     if not isinstance(record, Decision):
         return None
@@ -243,7 +245,7 @@ def chosen(record: Record | None) -> Chosen | None:
     )
 
 
-def context(
+def make_context(
     inp: StepInput, decisions_before: int, records_before: int, recorded: Record | None, replayed: Record | None
 ) -> Context:
     """Return the inputs of the tick `inp`, and the decisions that it led to."""
@@ -255,15 +257,15 @@ def context(
         position_m=None if newest is None else newest.position_m,
         position_age_s=None if newest is None else (inp.at_ns - newest.captured_ns) * 1e-9,
         vehicle="" if inp.vehicle is None else f"{inp.vehicle.mode}, {'armed' if inp.vehicle.armed else 'disarmed'}",
-        orders=tuple(map(_order, inp.commands)),
+        orders=tuple(map(_describe_order, inp.commands)),
         missed_ticks=inp.missed_ticks,
         stop=inp.stop,
-        recorded=chosen(recorded),
-        replayed=chosen(replayed),
+        recorded=read_choice(recorded),
+        replayed=read_choice(replayed),
     )
 
 
-def _order(command: Command) -> str:
+def _describe_order(command: Command) -> str:
     argument = command.position_m if command.height_m is None else command.height_m
     return command.order.value if argument is None else f"{command.order.value} {argument}"
 
@@ -329,7 +331,7 @@ class _Field:
     def add(self, parts: Iterable[Leaf], at_s: float) -> None:
         self.differing += 1
         for path, recorded, replayed in parts:
-            size = change(recorded, replayed)
+            size = compute_change(recorded, replayed)
             if size is not None and (self.largest is None or abs(size) > self.largest):
                 self.largest, self.largest_s, self.path = abs(size), at_s, path
 
@@ -372,9 +374,9 @@ class _Findings:
         if recorded is not None and replayed is not None and not are_identical(recorded, replayed):
             parts = [
                 leaf
-                for leaf in leaves(recorded, replayed)
-                if (topic, plain(leaf[0])) not in self.ignored
-                and not close(leaf[1], leaf[2], self._tolerance_of(topic))
+                for leaf in find_different_leaves(recorded, replayed)
+                if (topic, remove_indices(leaf[0])) not in self.ignored
+                and not are_close(leaf[1], leaf[2], self._tolerance_of(topic))
             ]
         differs = bool(parts) or recorded is None or replayed is None
         if differs:
@@ -388,7 +390,7 @@ class _Findings:
         self.decisions_differing += differs and topic == DECISION
         of_tick = topic == DECISION and self._tick is not None and at_ns == self._tick.at_ns
         if of_tick and self.context is None and self._tick is not None:
-            self.context = context(self._tick, *self._before, recorded, replayed)
+            self.context = make_context(self._tick, *self._before, recorded, replayed)
 
     def _tolerance_of(self, topic: str) -> float:
         """Return the tolerance of a topic: two numbers of a plan that are close may be rounded apart."""
@@ -408,11 +410,11 @@ class _Findings:
             field=path,
             meaning=meaning,
             unit=unit,
-            recorded=repr(left) if parts else brief(recorded),
-            replayed=repr(right) if parts else brief(replayed),
-            change=change(left, right),
+            recorded=repr(left) if parts else describe_record(recorded),
+            replayed=repr(right) if parts else describe_record(replayed),
+            change=compute_change(left, right),
             fields=len(parts),
-            stage=stage(topic),
+            stage=name_stage(topic),
         )
         if self.first is None:
             self.first, self._before = difference, (self.decisions, self.compared)
@@ -420,7 +422,7 @@ class _Findings:
             self.first_decision = self.first_decision or difference
         fields: dict[str, list[Leaf]] = defaultdict(list)
         for part in parts or [("", None, None)]:
-            fields[plain(part[0])].append(part)
+            fields[remove_indices(part[0])].append(part)
         for name, those in fields.items():
             field = self._fields.setdefault((topic, name), _Field(at_s, self._records[topic]))
             field.add(those, at_s)
@@ -475,19 +477,19 @@ def replay(
     loop = make_loop(produced)
     findings = _Findings(FieldNames(loop.plant), tolerance, ignored)
     for (topic, at_ns, message), core_error in _find_core_errors(messages):
-        record = _decoded(topic, at_ns, message) if _is_input(topic) or not isinstance(message, bytes) else None
+        record = _decode_records(topic, at_ns, message) if _is_input(topic) or not isinstance(message, bytes) else None
         if isinstance(record, StepInput):
             # What the last tick said must have been read by now. Only a torn file's last tick may lack some.
             _add_missing(findings, produced)
             findings.begin(record)
             for command in record.commands:
                 loop.order(command)
-            loop.answered(record.answered_ns)
+            loop.note_solve_time(record.answered_ns)
             loop.tick(record.tick, record.at_ns, discard, record.missed_ticks, record.stop, core_error)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):
-            loop.refused(record.link, record.counts, record.at_ns)
+            loop.add_refusals(record.link, record.counts, record.at_ns)
         elif isinstance(record, InternalError) and record.effect is not InternalErrorEffect.TICK:
             loop.handle_failure(record, discard)
         elif isinstance(record, RecorderNote):
@@ -502,7 +504,7 @@ def replay(
             ):
                 findings.same(topic)
             else:
-                findings.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
+                findings.compare(topic, at_ns, record or _decode_records(topic, at_ns, message), replayed)
     if finished:
         _add_missing(findings, produced)
     return findings.result(finished=finished)
@@ -520,7 +522,7 @@ def _find_core_errors(messages: Iterable[Message]) -> Iterator[tuple[Message, st
 
 
 def _add_core_error(of_tick: Sequence[Message]) -> Iterator[tuple[Message, str]]:
-    errors = [_decoded(*message) for message in of_tick if message[0] == FAILURE]
+    errors = [_decode_records(*message) for message in of_tick if message[0] == FAILURE]
     core_errors = [
         record.text
         for record in errors
@@ -529,7 +531,7 @@ def _add_core_error(of_tick: Sequence[Message]) -> Iterator[tuple[Message, str]]
     return ((message, "".join(core_errors[:1])) for message in of_tick)
 
 
-def _decoded(topic: str, at_ns: int, message: Record | bytes) -> Record:
+def _decode_records(topic: str, at_ns: int, message: Record | bytes) -> Record:
     return decode(topic, message, at_ns) if isinstance(message, bytes) else message
 
 

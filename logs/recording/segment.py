@@ -42,7 +42,8 @@ from mcap.records import (
 from mcap.records import SummaryOffset as Group
 from zstandard import ZstdCompressor
 
-from logs.recording.disk import MAGIC, OutputFile, is_present, make_segment_path
+from logs.recording.disk import OutputFile, is_present, make_segment_path
+from logs.recording.file_kind import MAGIC
 from logs.recording.topics import HEADER, Definition, get_definition, is_view
 from uavctl.config.types import LogConfig
 
@@ -127,7 +128,7 @@ class Segment:
         channel = self._channels.get(kind.topic)
         index = None if channel is None else self._indexes.get(channel.number)
         if channel is None:
-            channel, head = self._new_channel(kind)
+            channel, head = self._make_channel(kind)
         else:
             head = channel.record if index is None else b""
         size = MESSAGE.size + len(data)
@@ -166,11 +167,11 @@ class Segment:
         self.commit()
         if not records:
             return
-        prefix, at = self._prefix(), self.bytes
+        prefix, at = self._make_prefix(), self.bytes
         block, indexes = prefix, []
         for record in records:
-            data = _bytes(record)
-            indexes.append(_index(record, at + len(block), len(data)))
+            data = _pack_records(record)
+            indexes.append(_make_index(record, at + len(block), len(data)))
             block += data
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
@@ -190,7 +191,7 @@ class Segment:
             OSError: not all of it could be done; `abandon` does what is left.
         """
         self.commit()
-        self._file.write(self._tail())
+        self._file.write(self._make_tail())
         self._file.sync()
         self._file.close()
 
@@ -203,7 +204,7 @@ class Segment:
         try:
             self._file.truncate(self.bytes)
             try:
-                self._file.write(self._tail())
+                self._file.write(self._make_tail())
             except OSError:
                 self._file.truncate(self.bytes)
                 raise
@@ -218,16 +219,16 @@ class Segment:
         """
         self._file.close()
 
-    def _prefix(self) -> bytes:
+    def _make_prefix(self) -> bytes:
         """Return the bytes that the next write has to begin with: those that begin a file, or none."""
-        return b"" if self.bytes else MAGIC + _bytes(Header(profile="", library=_library()))
+        return b"" if self.bytes else MAGIC + _pack_records(Header(profile="", library=_name_library()))
 
     def _begin_chunk(self) -> None:
         self._parts: list[bytes] = []
         self._size = 0
         self._indexes: dict[int, list[int]] = {}  # channel -> log time, offset, log time, offset ...
 
-    def _new_channel(self, definition: Definition) -> tuple[_Channel, bytes]:
+    def _make_channel(self, definition: Definition) -> tuple[_Channel, bytes]:
         """Return the channel of a new topic, and the records that must stand before its first message."""
         schema = self._schemas.get(definition.schema_name)
         head = b""
@@ -239,7 +240,7 @@ class Segment:
                 data=definition.schema,
             )
             self._schemas[definition.schema_name] = schema
-            head = _bytes(schema)
+            head = _pack_records(schema)
         record = Channel(
             id=len(self._channels) + 1,
             topic=definition.topic,
@@ -247,7 +248,7 @@ class Segment:
             schema_id=0 if schema is None else schema.id,
             metadata={ZERO_UTC: str(self._zero_utc_ns)} if self._zero_utc_ns else {},
         )
-        channel = self._channels[definition.topic] = _Channel(record.id, _bytes(record))
+        channel = self._channels[definition.topic] = _Channel(record.id, _pack_records(record))
         return channel, head + channel.record
 
     def _commit(self, entries: list[QueuedMessage]) -> None:
@@ -259,7 +260,7 @@ class Segment:
         head = CHUNK.pack(Opcode.CHUNK, fields, first, last, size, zlib.crc32(content), len(COMPRESSION))
         head += COMPRESSION + STORED_SIZE.pack(len(stored))
         length = len(head) + len(stored)
-        prefix = self._prefix()
+        prefix = self._make_prefix()
         start = self.bytes + len(prefix)
         at, offsets = start + length, []
         indexes = []
@@ -290,33 +291,34 @@ class Segment:
         self._counts.update({channel_id: len(flat) // 2 for channel_id, flat in self._indexes.items()})
         self._begin_chunk()
 
-    def _tail(self) -> bytes:
+    def _make_tail(self) -> bytes:
         """Return the bytes that end a file: end of data, summary, footer."""
-        prefix = self._prefix()
-        data_end = prefix + _bytes(DataEnd(zlib.crc32(prefix, self._crc)))
+        prefix = self._make_prefix()
+        data_end = prefix + _pack_records(DataEnd(zlib.crc32(prefix, self._crc)))
         start = self.bytes + len(data_end)
         groups = (
-            (Opcode.SCHEMA, _bytes(*self._schemas.values())),
+            (Opcode.SCHEMA, _pack_records(*self._schemas.values())),
             (Opcode.CHANNEL, b"".join(channel.record for channel in self._channels.values())),
-            (Opcode.STATISTICS, _bytes(self._statistics())),
+            (Opcode.STATISTICS, _pack_records(self._make_statistics())),
             (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
-            (Opcode.ATTACHMENT_INDEX, _bytes(*self._list_indexes(AttachmentIndex))),
-            (Opcode.METADATA_INDEX, _bytes(*self._list_indexes(MetadataIndex))),
+            (Opcode.ATTACHMENT_INDEX, _pack_records(*self._list_indexes(AttachmentIndex))),
+            (Opcode.METADATA_INDEX, _pack_records(*self._list_indexes(MetadataIndex))),
         )
         summary, offsets = b"", b""
         for opcode, data in groups:
             if data:
-                offsets += _bytes(Group(group_opcode=opcode, group_start=start + len(summary), group_length=len(data)))
+                group = Group(group_opcode=opcode, group_start=start + len(summary), group_length=len(data))
+                offsets += _pack_records(group)
             summary += data
         offset_start = start + len(summary)
         crc = zlib.crc32(summary + offsets + _FOOTER.pack(Opcode.FOOTER, 20, start, offset_start))
-        footer = _bytes(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
+        footer = _pack_records(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
         return data_end + summary + offsets + footer + MAGIC
 
     def _list_indexes(self, kind: type[AttachmentIndex | MetadataIndex]) -> list[AttachmentIndex | MetadataIndex]:
         return [attachment for attachment in self._attached if isinstance(attachment, kind)]
 
-    def _statistics(self) -> Statistics:
+    def _make_statistics(self) -> Statistics:
         first, last = self._times_ns or (0, 0)
         return Statistics(
             attachment_count=len(self._list_indexes(AttachmentIndex)),
@@ -331,7 +333,7 @@ class Segment:
         )
 
 
-def _bytes(*records: McapRecord) -> bytes:
+def _pack_records(*records: McapRecord) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -339,7 +341,7 @@ def _bytes(*records: McapRecord) -> bytes:
     return data
 
 
-def _index(record: Attachment | Metadata, offset: int, length: int) -> AttachmentIndex | MetadataIndex:
+def _make_index(record: Attachment | Metadata, offset: int, length: int) -> AttachmentIndex | MetadataIndex:
     if isinstance(record, Metadata):
         return MetadataIndex(offset=offset, length=length, name=record.name)
     return AttachmentIndex(
@@ -354,7 +356,7 @@ def _index(record: Attachment | Metadata, offset: int, length: int) -> Attachmen
 
 
 @cache
-def _library() -> str:
+def _name_library() -> str:
     return f"uavctl mcap-records-{version('mcap')}"
 
 

@@ -28,7 +28,7 @@ _STATES = frozenset(
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_VFR_HUD,
     }
 )  # fmt: skip
-_MOST_AT_ONCE = 128  # numbers of a sequence of 256 that are missing at once; more is disorder
+_MAX_MISSING = 128  # numbers of a sequence of 256 that are missing at once; more is disorder
 
 
 class LogSender(msgspec.Struct, frozen=True, kw_only=True):
@@ -130,7 +130,7 @@ class SenderCounter:
         skipped = (number - self._last.get(sender, number - 1) - 1) % 256
         self._last[sender] = number
         self._messages[sender] = self._messages.get(sender, 0) + 1
-        self._missing[sender] = self._missing.get(sender, 0) + (skipped if skipped <= _MOST_AT_ONCE else 0)
+        self._missing[sender] = self._missing.get(sender, 0) + (skipped if skipped <= _MAX_MISSING else 0)
 
     def take_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Take what a sender says that it is."""

@@ -15,9 +15,11 @@ import msgspec
 import numpy as np
 
 from logs.recording.budget import read_whole
-from logs.recording.disk import describe_kind_error, refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.export import Watch, count_messages, ignore_progress
-from logs.recording.reader import RecordedMessage, good_messages, header
+from logs.recording.file_kind import describe_kind_error
+from logs.recording.file_scan import RecordedMessage
+from logs.recording.output_files import refuse_existing_files, remove_on_error, write_temporary_files
+from logs.recording.reader import read_header, read_messages
 from logs.recording.summary import count
 from logs.recording.topics import parse_raw_topic
 from uavctl.config.load import parse_stored_toml
@@ -28,10 +30,10 @@ from uavctl.mavlink.framing import is_frame
 from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, discard
 
 # Clocks are set by hand, by a GPS or by a server; what is no more than this is order, or a silence.
-FARTHEST_BACK_NS = 1_000_000_000
-LONGEST_SILENCE_NS = 3600 * 1_000_000_000
+MAX_BACKSTEP_NS = 1_000_000_000
+MAX_SILENCE_NS = 3600 * 1_000_000_000
 _MIN_REPORTED_SILENCE_NS = 10_000_000_000  # a vehicle's heartbeats come once a second
-_MOST_AT_ONCE = 200  # packets of one stamp: what a fast link brings within the 16 ms of a coarse clock is less
+_MAX_SAME_STAMPS = 200  # packets of one stamp: what a fast link brings within the 16 ms of a coarse clock is less
 
 
 class MonotonicClock:
@@ -49,11 +51,11 @@ class MonotonicClock:
         self._same = True  # all stamps so far are that one
         self._farthest_ns = self._silence_ns = 0
 
-    def expects(self, stamp_ns: int) -> bool:
+    def can_follow(self, stamp_ns: int) -> bool:
         """Return whether a stamp may follow the others without a leap; not before the first."""
-        return self._fitting(stamp_ns) is not None
+        return self._find_offset_ns(stamp_ns) is not None
 
-    def steady(self, stamp_ns: int) -> int:
+    def convert(self, stamp_ns: int) -> int:
         """Return the steady time of a stamp [ns]; stamps come in the order of the recording."""
         self._stamps += 1
         self._zeros += stamp_ns == 0
@@ -61,7 +63,7 @@ class MonotonicClock:
         self._same = self._same and stamp_ns == self._first_ns
         if self._last_ns is None:
             self._last_ns = stamp_ns
-        offset_ns = self._fitting(stamp_ns)
+        offset_ns = self._find_offset_ns(stamp_ns)
         if offset_ns is None and stamp_ns == 0:
             self._missing += 1
             return self._last_ns
@@ -85,10 +87,10 @@ class MonotonicClock:
         """
         if self._zeros == self._stamps > 1:
             raise RecordingError(f"{name}: all {self._stamps} time stamps are zero, so nobody knows what came when")
-        if self._same and self._stamps > _MOST_AT_ONCE:
+        if self._same and self._stamps > _MAX_SAME_STAMPS:
             raise RecordingError(f"{name}: all {self._stamps} time stamps are the same, so they tell no time")
 
-    def notes(self, name: str) -> tuple[str, ...]:
+    def describe_oddities(self, name: str) -> tuple[str, ...]:
         """Return sentences on what was odd about the stamps."""
         notes = []
         if self._jumps:
@@ -104,12 +106,12 @@ class MonotonicClock:
             notes.append(f"{name}: nothing in it for {self._silence_ns * 1e-9:.0f} s")
         return tuple(notes)
 
-    def _fitting(self, stamp_ns: int) -> int | None:
+    def _find_offset_ns(self, stamp_ns: int) -> int | None:
         """Return which of the last two offsets a stamp fits [ns]; None if neither."""
         if self._last_ns is None:
             return None
         for offset_ns in (self._offset_ns, self._former_ns):
-            if -FARTHEST_BACK_NS <= stamp_ns + offset_ns - self._last_ns <= LONGEST_SILENCE_NS:
+            if -MAX_BACKSTEP_NS <= stamp_ns + offset_ns - self._last_ns <= MAX_SILENCE_NS:
                 return offset_ns
         return None
 
@@ -188,7 +190,7 @@ def read_tlog(path: Path) -> Tlog:
         sort_packets(cutter.packets),
         torn_bytes=cutter.torn_bytes,
         skipped_bytes=cutter.skipped_bytes,
-        clock_notes=(*note, *cutter.clock.notes(path.name)),
+        clock_notes=(*note, *cutter.clock.describe_oddities(path.name)),
     )
 
 
@@ -216,12 +218,12 @@ class _Cutter:
             length = get_frame_length(data, begin)
             end = begin + length
             stamp_us = self._stamp_us(at)
-            expected = bool(length) and self.clock.expects(stamp_us * 1000)
+            expected = bool(length) and self.clock.can_follow(stamp_us * 1000)
             if expected and end > len(data):
                 break
             if expected or (length and self._is_believed(stamp_us, begin, end)):
                 self._first = self._first if self.packets else begin
-                self.packets.append(make_packet(self.clock.steady(stamp_us * 1000), data[begin:end]))
+                self.packets.append(make_packet(self.clock.convert(stamp_us * 1000), data[begin:end]))
                 at = end
             else:
                 likely = _LIKELY[self._stamp].search(data, at + 1)
@@ -254,7 +256,7 @@ class _Cutter:
         if end > len(data) or stamp_us >= _LAST_STAMP_US:
             return False
         follows = get_frame_length(data, end + self._stamp.size) > 0
-        if follows and abs(self._stamp_us(end) - stamp_us) * 1000 <= LONGEST_SILENCE_NS:
+        if follows and abs(self._stamp_us(end) - stamp_us) * 1000 <= MAX_SILENCE_NS:
             return True
         return is_frame(data[begin:end])
 
@@ -312,13 +314,13 @@ def export_tlog(
             file cannot be written.
         UsageError: There is no such connection, or the file exists and is not to be overwritten.
     """
-    first = header(flight)
+    first = read_header(flight)
     zero_utc_ns = find_utc_of_zero(flight, first)
     refuse_existing_files([file], force=force)
     packets: Counter[str] = Counter()
     raw = _Raw(_find_streams(first))
     with remove_on_error([file]), write_temporary_files([file]) as parts, parts[file].open("wb") as out:
-        messages = watch(good_messages(flight), count_messages(flight), "writing")
+        messages = watch(read_messages(flight), count_messages(flight), "writing")
         for at_ns, topic, packet in _merge_packets(raw.packets(messages, link)):
             out.write(_STAMP.pack((zero_utc_ns + at_ns) // 1000) + packet)
             packets[topic] += 1

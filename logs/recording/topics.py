@@ -90,7 +90,7 @@ class Topic:
             encoding="json",
             schema_name=f"uavctl.{self.record.__name__}",
             schema_encoding="jsonschema",
-            schema=msgspec.json.encode(_schema(self.record)),
+            schema=msgspec.json.encode(_make_schema(self.record)),
         )
 
 
@@ -162,7 +162,7 @@ def get_definition(topic: str) -> Definition:
     return _BY_NAME[topic].definition
 
 
-def _schema(record: type[Record]) -> dict[str, object]:
+def _make_schema(record: type[Record]) -> dict[str, object]:
     (reference,), parts = msgspec.json.schema_components(
         [record], schema_hook=_make_any_schema, ref_template="#/$defs/{name}"
     )
@@ -181,7 +181,7 @@ def _make_any_schema(kind: type) -> dict[str, object]:
 _MAX_TIME_NS = 2**64 - 1
 MATRICES = ("inputs", "states", "backoff_x", "backoff_u")  # of a plan, rounded in recordings
 DIGITS = 4  # of them: of 3 m, a millimetre
-_LEAST = 1e-12  # a smaller number is left as it is: its power of ten would not be exact
+_MIN_ROUNDED = 1e-12  # a smaller number is left as it is: its power of ten would not be exact
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -245,7 +245,7 @@ def round_plan(plan: Plan) -> Plan:
 def _round(values: Array) -> Array:
     """Round to `DIGITS` significant digits; what is zero, too small or not finite stays."""
     size = np.abs(values)
-    counts = (size > _LEAST) & (size < np.inf)
+    counts = (size > _MIN_ROUNDED) & (size < np.inf)
     # scale = 10^(digits − 1 − floor(log10 |x|)), rounded = rint(x · scale) / scale
     digits = DIGITS - 1 - np.floor(np.log10(np.where(counts, size, 1.0)))
     up, down = 10.0 ** np.maximum(digits, 0.0), 10.0 ** np.maximum(-digits, 0.0)  # exact powers: no digit is added
@@ -310,7 +310,7 @@ def decode(topic: str, data: bytes, at_ns: int) -> Record:
 
 def _decode_fields(data: bytes, kind: type[Record]) -> Record:
     if b'NaN"' not in data and b'Infinity"' not in data:
-        return _decoder(kind).decode(data)
+        return _make_decoder(kind).decode(data)
     fields = msgspec.json.decode(data)
     # the gap of most plans is the only one: their thousands of numbers need not be looked through
     if isinstance(fields, dict) and _restore_fields(fields, kind) == data.count(b'NaN"') + data.count(b'Infinity"'):
@@ -319,7 +319,7 @@ def _decode_fields(data: bytes, kind: type[Record]) -> Record:
 
 
 @cache
-def _decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
+def _make_decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
     return msgspec.json.Decoder(kind)
 
 
@@ -333,12 +333,12 @@ def _get_exact_bytes(value: object) -> bytes | None:
 
 def _is_non_finite(record: Record) -> bool:
     """Return whether a field of type float is not finite, as the gap of most plans is."""
-    values = [getattr(record, name) for name in _float_fields(type(record))]
+    values = [getattr(record, name) for name in _list_float_fields(type(record))]
     return any(type(value) is float and not math.isfinite(value) for value in values)
 
 
 @cache
-def _float_fields(kind: type[Record]) -> tuple[str, ...]:
+def _list_float_fields(kind: type[Record]) -> tuple[str, ...]:
     return tuple(field.name for field in msgspec.structs.fields(kind) if field.type is float)
 
 
@@ -367,7 +367,7 @@ def _spell_tree(value: object) -> object:
 
 def _restore_fields(fields: dict[str, object], kind: type[Record]) -> int:
     """Turn spelled floats back where a field itself is a float; return how many."""
-    number_texts = {name: value for name in _float_fields(kind) if isinstance(value := fields.get(name), str)}
+    number_texts = {name: value for name in _list_float_fields(kind) if isinstance(value := fields.get(name), str)}
     restored = {name: _NON_FINITE[text] for name, text in number_texts.items() if text in _NON_FINITE}
     fields.update(restored)
     return len(restored)
@@ -376,24 +376,26 @@ def _restore_fields(fields: dict[str, object], kind: type[Record]) -> int:
 def _restore_tree(value: object, kind: object) -> object:
     """Return a tree with spelled floats turned back, where the type has a float; text stays text."""
     if isinstance(value, str):
-        return _NON_FINITE.get(value, value) if float in _alternatives(kind) else value
+        return _NON_FINITE.get(value, value) if float in _list_alternatives(kind) else value
     if isinstance(value, list):
-        return [_restore_tree(entry, item) for entry, item in zip(value, _item_types(kind, len(value)), strict=True)]
+        return [
+            _restore_tree(entry, item) for entry, item in zip(value, _list_item_types(kind, len(value)), strict=True)
+        ]
     if isinstance(value, dict):
-        return {key: _restore_tree(element, _field_type(kind, key)) for key, element in value.items()}
+        return {key: _restore_tree(element, _get_field_type(kind, key)) for key, element in value.items()}
     return value
 
 
 @cache
-def _alternatives(kind: object) -> tuple[object, ...]:
+def _list_alternatives(kind: object) -> tuple[object, ...]:
     """Return the members of a union; the type itself if it is none."""
     if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
         return typing.get_args(kind)
     return (kind,)
 
 
-def _item_types(kind: object, count: int) -> tuple[object, ...]:
-    for alternative in _alternatives(kind):
+def _list_item_types(kind: object, count: int) -> tuple[object, ...]:
+    for alternative in _list_alternatives(kind):
         if typing.get_origin(alternative) is tuple:
             args = typing.get_args(alternative)
             items = args[:1] * count if args[-1] is Ellipsis else args
@@ -402,15 +404,15 @@ def _item_types(kind: object, count: int) -> tuple[object, ...]:
     return (object,) * count
 
 
-def _field_type(kind: object, key: str) -> object:
-    for alternative in _alternatives(kind):
+def _get_field_type(kind: object, key: str) -> object:
+    for alternative in _list_alternatives(kind):
         if typing.get_origin(alternative) is dict:
             return typing.get_args(alternative)[1]
         if isinstance(alternative, type) and issubclass(alternative, msgspec.Struct):
-            return _fields(alternative).get(key, object)
+            return _list_fields(alternative).get(key, object)
     return object
 
 
 @cache
-def _fields(kind: type[msgspec.Struct]) -> dict[str, object]:
+def _list_fields(kind: type[msgspec.Struct]) -> dict[str, object]:
     return {field.encode_name: field.type for field in msgspec.structs.fields(kind)}

@@ -344,12 +344,12 @@ class ViewBuilder:
             self._zero_utc_ns = record.zero_utc_ns or 0
         if self._design is None or isinstance(record, Datagram):  # half of all records
             return []
-        views = [*self._views(self._design, at_ns, record)]
+        views = [*self._make_views(self._design, at_ns, record)]
         messages = [(topic, view.SerializeToString()) for topic, view in views]
-        messages += [(topics.PLOTS[type(plot)], pack_message(plot)) for plot in self._plots(self._design, record)]
+        messages += [(topics.PLOTS[type(plot)], pack_message(plot)) for plot in self._make_plots(self._design, record)]
         return messages
 
-    def _plots(self, design: DesignView, record: Record) -> Iterator[Record]:
+    def _make_plots(self, design: DesignView, record: Record) -> Iterator[Record]:
         match record:
             case Decision():
                 captured_ns = None if self._estimate is None else self._estimate.captured_ns
@@ -374,12 +374,12 @@ class ViewBuilder:
             case VehicleStatus():
                 yield topics.copy_fields(topics.VehiclePlot, record, battery_v=topics.replace_missing(record.battery_v))
 
-    def _views(self, design: DesignView, at_ns: int, record: Record) -> Iterator[_Item]:
+    def _make_views(self, design: DesignView, at_ns: int, record: Record) -> Iterator[_Item]:
         match record:
             case Header() | Decision():
-                yield from self._still(design, at_ns)
+                yield from self._make_still_views(design, at_ns)
                 if isinstance(record, Decision):
-                    yield from self._decision(design, record)
+                    yield from self._make_decision_views(design, record)
             case Estimate():
                 self._estimate = record
                 at_m = design.position_of(record.mean)
@@ -409,14 +409,14 @@ class ViewBuilder:
                 event = Event(at_ns=at_ns, severity=Severity.WARNING, code=EventCode.RECORDING, text=record.text)
                 yield topics.LOG, make_log_message(event, at_ns + self._zero_utc_ns)
 
-    def _still(self, design: DesignView, at_ns: int) -> Iterator[_Item]:
+    def _make_still_views(self, design: DesignView, at_ns: int) -> Iterator[_Item]:
         """Yield the scenes that do not move, when they are due."""
         if at_ns >= self._still_ns:
             self._still_ns = at_ns + STILL_NS
             yield topics.FRAMES, make_frames(at_ns + self._zero_utc_ns)
             yield topics.ROOM_SCENE, draw_room(at_ns + self._zero_utc_ns, design)
 
-    def _decision(self, design: DesignView, decision: Decision) -> Iterator[_Item]:
+    def _make_decision_views(self, design: DesignView, decision: Decision) -> Iterator[_Item]:
         utc_ns = decision.at_ns + self._zero_utc_ns
         if decision.boundary:
             yield topics.LINK_SCENE, draw_link(utc_ns, design, decision)

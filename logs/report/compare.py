@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from logs.recording.file_scan import RecordedMessage
 from logs.recording.flight import FlightData
 from logs.recording.info import read_info
 from logs.recording.parameters import VehicleParameter
-from logs.recording.reader import RecordedMessage, good_messages, read
-from logs.recording.replay import leaves
+from logs.recording.reader import read, read_messages
+from logs.recording.replay import find_different_leaves
 from logs.recording.summary import FlightSummary, Percentiles, compute_position_errors_m, summarise
 from logs.recording.topics import HEADER, LIBRARY, RECORDER, decode, parse_raw_topic
 from uavctl.config.load import flatten_keys, parse_stored_toml
@@ -241,7 +242,7 @@ def _compare_records(first: LoadedFlight, other: LoadedFlight) -> Match:
     first_messages, other_messages = (
         filter(
             lambda message: message.definition.topic not in _IGNORED_TOPICS,
-            good_messages(Path(recording.identity.recording)),
+            read_messages(Path(recording.identity.recording)),
         )
         for recording in (first, other)
     )
@@ -276,7 +277,7 @@ def _find_divergence(
     elif parse_raw_topic(topic) is not None:
         contents = (_describe_frame(first_message.data), _describe_frame(other_message.data))
     else:
-        field, first_value, other_value = leaves(
+        field, first_value, other_value = find_different_leaves(
             decode(*_get_content(first_message)), decode(*_get_content(other_message))
         )[0]
         contents = (repr(first_value), repr(other_value))

@@ -10,8 +10,8 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 
 from logs.recording.design_view import AXIS_NUMBER
-from logs.recording.disk import refuse_recording_path, write_atomically
 from logs.recording.flight import FlightData
+from logs.recording.output_files import refuse_recording_path, write_atomically
 from logs.report import page
 from logs.report.compare import FlightComparison, LoadedFlight
 from logs.report.compare_text import (

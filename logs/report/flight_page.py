@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from logs.recording.design_view import get_config_name
-from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
+from logs.recording.output_files import write_atomically
 from logs.recording.reader import read
 from logs.recording.summary import FlightSummary, find_input_violations, find_state_violations, list_summary_rows
 from logs.report import figures, link_figures, page, plan_figures, plots

@@ -9,8 +9,8 @@ import numpy as np
 from markupsafe import Markup
 
 from logs.recording.design_view import AXIS_NUMBER
-from logs.recording.disk import write_atomically
-from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, rate_of
+from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, format_rate, list_facts
+from logs.recording.output_files import write_atomically
 from logs.report import page
 from logs.report.figures import thin_keeping_largest
 from logs.report.page import Mark, PageSection
@@ -97,7 +97,7 @@ def _make_sections(flight: MavlinkFlight) -> Iterator[PageSection]:
     texts = [(f"{text.at_s:.2f}", text.severity, text.text) for text in info.texts]
     if texts:
         yield PageSection("Texts of the vehicle", "", _make_table(("at [s]", "severity", "text"), texts))
-    messages = [(name, str(number), rate_of(info, name)) for name, number in info.messages.items()]
+    messages = [(name, str(number), format_rate(info, name)) for name, number in info.messages.items()]
     parameters = [(name, str(parameter.value), parameter.type) for name, parameter in info.parameters.items()]
     folded = page.render_folded(
         "Messages", page.render_table(("message", "number", "rate"), messages, frozenset({1, 2}))
@@ -108,7 +108,7 @@ def _make_sections(flight: MavlinkFlight) -> Iterator[PageSection]:
             "Parameters of the vehicle", page.render_table(columns, parameters, frozenset({1}))
         )
     yield PageSection("What is in it", "", folded)
-    yield PageSection("Summary", "", page.render_list(describe_recording(info)) + page.render_facts(facts_of(info)))
+    yield PageSection("Summary", "", page.render_list(describe_recording(info)) + page.render_facts(list_facts(info)))
 
 
 def _make_table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Markup:

@@ -15,7 +15,7 @@ from uavctl.check.check_data import CheckData, Sample
 from uavctl.check.findings import ItemState
 from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
-from uavctl.loop import make_links
+from uavctl.mavlink.connection import make_links
 from uavctl.mavlink.messages import Heartbeat
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])

@@ -18,7 +18,7 @@ from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.config.connections import CheckConfig
 from uavctl.lab.position_loop import EXTERNAL_ONLY
-from uavctl.loop import make_links
+from uavctl.mavlink.connection import make_links
 from uavctl.records import Outgoing, discard
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])

@@ -24,7 +24,7 @@ from uavctl.cli.init import format_room, parse_sizes
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.lab.position_loop import EXTERNAL_ONLY
-from uavctl.loop import make_links
+from uavctl.mavlink.connection import make_links
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 

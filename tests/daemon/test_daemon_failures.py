@@ -130,7 +130,7 @@ def test_87_a_read_that_fails_for_a_moment_does_not_end_the_flight(
 @BOTH
 def test_88_orders_that_fail_end_the_flight_in_order(autopilot: str) -> None:
     rig = make_rig(autopilot)
-    rig.engagement = fail_from(rig, lambda *_: None)  # type: ignore[assignment]
+    rig.give_orders = fail_from(rig, lambda *_: None)  # type: ignore[assignment]
     with pytest.raises(MemoryError):
         rig.fly()
     modes = list(dict.fromkeys(decision.mode for decision in rig.memory.of(Decision)))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from uavctl.daemon.lock import LONGEST_FLIGHT_NS, VehicleLock, identify_connection, lock_vehicle
+from uavctl.daemon.lock import MAX_FLIGHT_NS, VehicleLock, identify_connection, lock_vehicle
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
 URL = "udpin://127.0.0.1:14540"
@@ -147,8 +147,8 @@ def test_a_flight_that_ends_in_the_air_is_left_too(tmp_path: Path) -> None:
 def test_what_the_last_holder_wrote_counts_for_as_long_as_a_battery_lasts(
     tmp_path: Path, word: str, leaves: bool
 ) -> None:
-    now = 2 * LONGEST_FLIGHT_NS
-    times = {"now": now, "ago": now - LONGEST_FLIGHT_NS, "long_ago": now - LONGEST_FLIGHT_NS - 1, "to_come": now + 1}
+    now = 2 * MAX_FLIGHT_NS
+    times = {"now": now, "ago": now - MAX_FLIGHT_NS, "long_ago": now - MAX_FLIGHT_NS - 1, "to_come": now + 1}
     file = tmp_path / "lock"
     file.write_bytes(f"123 {URL}\n{word.format(**times)}\n".encode("latin-1"))
     with file.open("r+b") as one:

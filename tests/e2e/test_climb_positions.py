@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from take_off_rig import GOAL, RELAYED, TakeOffRig
 
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.checks import get_position_index
@@ -111,7 +111,7 @@ def fly_with_gps(folder: Path, seed: int, seconds: float, *settings: str) -> tup
     sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in get_position_index(config.plant)]
     beyond = [
         max(low - place, place - high)
-        for truth in records(folder / "flight.mcap", Truth)
+        for truth in read_kind(folder / "flight.mcap", Truth)
         for (low, high), place in zip(sides, truth.position_m, strict=True)
     ]
     return code, max(beyond)

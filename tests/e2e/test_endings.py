@@ -34,7 +34,7 @@ from uavctl import loop as control
 from uavctl.account import FlightAccount, make_ending
 from uavctl.cause import CAUSES, Cause
 from uavctl.cli.app import run
-from uavctl.daemon import engagement
+from uavctl.daemon import flight_orders
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
@@ -512,7 +512,7 @@ def test_a_cut_off_end_is_reported_everywhere(
     tmp_path: Path, run_flight: RunFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
-    monkeypatch.setattr(engagement, "LANDING_S", 1.0)
+    monkeypatch.setattr(flight_orders, "LANDING_S", 1.0)
     rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, drop_messages("COMMAND_LONG"))
     report = run_flight(rig.add_step_in(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.ENDED_IN_AIR)
     assert (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from uavctl.cli.app import run
 from uavctl.records import Event
 
@@ -70,7 +70,7 @@ def test_a_flight_from_the_ground_to_a_place_and_back(capsys: pytest.CaptureFixt
     code, out, err = run_loopback(capsys, "loopback", *arguments, *FLOOR)
     assert code == 0, err
     assert json.loads(out)["steps"] > 30
-    texts = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
+    texts = [event.text for event in read_kind(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
     assert texts[-1].startswith("settling -> done")
     code, out, _ = run_loopback(capsys, "log", "replay", str(tmp_path / "flight.mcap"), "--json")
     assert code == 0 and json.loads(out)["identical"]
@@ -96,5 +96,5 @@ def test_the_same_way_over_real_sockets(capsys: pytest.CaptureFixture[str], tmp_
     arguments = ["--udp", "--arm", "--takeoff", "1", "--goto", "0.3,0.3,-1", "--duration", "9", "--out", str(tmp_path)]
     code, _, err = run_loopback(capsys, "loopback", *arguments, *FLOOR)
     assert code == 0, err
-    texts = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
+    texts = [event.text for event in read_kind(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
     assert texts[-1].startswith("settling -> done")

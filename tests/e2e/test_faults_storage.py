@@ -16,9 +16,10 @@ from places import ROOT
 from recording_fakes import Clock, Disk, Item, drop_recorder_notes, flight, record_flight, stored_byte
 
 from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.file_scan import Damage, RecordedMessage, scan_file
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import Damage, RecordedMessage, read, records, scan, segment_files
+from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import Recorder, SyncRecorder
 from logs.recording.recover import recover
 from sim.simulation import World
@@ -50,8 +51,8 @@ class FullDisk:
 
 def assert_segments_begin_once(path: Path) -> None:
     """Each file has one header, and one note of why it was begun, however often that was tried."""
-    for file in segment_files(path):
-        results = [item for item in scan(file) if isinstance(item, RecordedMessage)]
+    for file in find_segments(path):
+        results = [item for item in scan_file(file) if isinstance(item, RecordedMessage)]
         assert [item.definition.topic for item in results].count("/uavctl/header") == 1
         assert results[0].definition.topic == "/uavctl/header"
         assert sum(b"after a failed write" in item.data for item in results) == (file != path)
@@ -121,7 +122,7 @@ def test_29_queue_is_bounded_while_the_disk_is_full(tmp_path: Path) -> None:
     got = drop_recorder_notes(list(read(path)))
     assert len(got) + final.dropped == len(items)
     assert got == [item for item in items if item in got]
-    assert list(records(path, RecorderNote))[-1].dropped == final.dropped == read_info(path).dropped
+    assert list(read_kind(path, RecorderNote))[-1].dropped == final.dropped == read_info(path).dropped
 
 
 @pytest.mark.fault(29)
@@ -276,14 +277,14 @@ def test_32_a_flipped_byte_anywhere_is_never_a_wrong_value(tmp_path: Path, finis
 def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 60)
-    whole = [item for item in scan(path) if isinstance(item, RecordedMessage)]
+    whole = [item for item in scan_file(path) if isinstance(item, RecordedMessage)]
     data = path.read_bytes()
     offsets = sorted({item.offset for item in whole})
     assert len(offsets) > 8
     for offset in offsets:
         for position in (offset, offset + 3, offset + 8, offset + 33, offset + 60):
             path.write_bytes(flip_byte(data, position, 4))
-            result = list(scan(path))
+            result = list(scan_file(path))
             assert [item for item in result if isinstance(item, RecordedMessage)] == [
                 item for item in whole if item.offset != offset
             ]

@@ -20,7 +20,7 @@ from loopback_rig import make_loop
 from operation_rig import end_process
 from places import TESTS, without_pages
 
-from logs.recording.reader import read, records
+from logs.recording.reader import read, read_kind
 from logs.recording.replay import replay
 from uavctl.cli.app import run
 from uavctl.config import load_config
@@ -124,13 +124,13 @@ def test_a_second_daemon_is_refused_before_it_makes_anything(
 @pytest.mark.slow
 def test_a_requested_end_leaves_no_note_for_the_next_daemon(flown: Flown) -> None:
     """The source neither lands nor disarms; yet the next one on this port is flown like any other."""
-    url = next(iter(records(flown[3], Header))).command.split("--vehicle ")[1].split()[0]
+    url = next(iter(read_kind(flown[3], Header))).command.split("--vehicle ")[1].split()[0]
     assert not any(lock_path.exists() for lock_path in find_lock_paths(url))
 
 
 def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> None:
     """Told by the steps: a machine that stood still leaves some out, and may make more pauses than the source's."""
-    every = [d for d in records(flown[3], Decision) if d.boundary and d.age_steps is not None]
+    every = [d for d in read_kind(flown[3], Decision) if d.boundary and d.age_steps is not None]
     asked = next(i for i, d in enumerate(every) if "operator" in d.reason)
     decisions = [(d, d.age_steps or 0) for d in every[:asked]]
     horizon = load_config("room").smpc.horizon
@@ -147,13 +147,13 @@ def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> No
 
 
 def test_the_hand_over_ends_in_zero(flown: Flown) -> None:
-    last = [*records(flown[3], Setpoint)][-1]
+    last = [*read_kind(flown[3], Setpoint)][-1]
     assert last.source is SetpointSource.HOLD and last.accel_mps2 == (0.0, 0.0, 0.0)
-    assert ControlMode.LAND in [d.mode for d in records(flown[3], Decision)][-200:]
+    assert ControlMode.LAND in [d.mode for d in read_kind(flown[3], Decision)][-200:]
 
 
 def test_the_recording_replays_identically(flown: Flown) -> None:
-    header = next(records(flown[3], Header))
+    header = next(read_kind(flown[3], Header))
     config = parse(header.config_toml, "recording").config
     result = replay(read(flown[3]), lambda sink: make_loop(config, sink))
     assert result.identical, result.first_difference
@@ -166,7 +166,7 @@ def test_sigterm_closes_the_recording_even_without_a_vehicle(tmp_path: Path) -> 
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=LIMIT_S)
         assert process.returncode == 1  # ran, but flew nothing
-    assert [*records(tmp_path / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
+    assert [*read_kind(tmp_path / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
 
 
 @pytest.mark.usefixtures("no_page")
@@ -174,12 +174,12 @@ def test_a_duration_closes_the_recording_even_without_a_vehicle(tmp_path: Path, 
     url = f"udpin://127.0.0.1:{free_port()}"
     places = ["--out", str(tmp_path / "flight"), "--control", control]
     assert run(["fly", "--vehicle", url, "--mocap", url, "--duration", "0.2", *places]) == 1  # ran, but flew nothing
-    assert [*records(tmp_path / "flight" / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
+    assert [*read_kind(tmp_path / "flight" / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
 
 
 def test_only_the_pilot_engages(flown: Flown) -> None:
     # The table itself is tested in test_mode; here: nobody but the pilot engaged.
-    hand_overs = [e.text for e in records(flown[3], Event) if e.code == "hand-over"]
+    hand_overs = [e.text for e in read_kind(flown[3], Event) if e.code == "hand-over"]
     assert hand_overs[0].startswith("waiting -> engaged")
 
 

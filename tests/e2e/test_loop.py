@@ -14,7 +14,7 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.event_codes import EventCode
-from uavctl.loop import MAX_SAMPLES
+from uavctl.inbox import MAX_SAMPLES
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.handover import NEW_HEARTBEAT_NS, HandoverOutput, HandoverStateMachine
@@ -128,16 +128,16 @@ def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes
 def test_after_lost_messages_nothing_is_sent_until_the_next_heartbeat(why: str) -> None:
     rig = LoopRig('solver.method="exact"')
     rig.run(40)
-    rig.loop.refused("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
+    rig.loop.add_refusals("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
     assert rig.run(5, deaf=True).count(SETPOINT) == 5
     rig.heartbeat(OFFBOARD)
-    reported = rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
+    reported = rig.loop.add_refusals("vehicle", {why: 3}, rig.tick * TICK_NS)
     assert [event.code for event in reported] == ["hung-up"] * (why == "hung-up")  # a person at the console is told
     silent = rig.run(20, deaf=True)
     assert not {SETPOINT, LAND} & set(silent)
     rig.heartbeat(OFFBOARD, late_ns=1)
     assert rig.run(20, deaf=True).count(SETPOINT) == 20
-    rig.loop.refused("vehicle", {why: 1}, rig.tick * TICK_NS)
+    rig.loop.add_refusals("vehicle", {why: 1}, rig.tick * TICK_NS)
     rig.heartbeat(HOLD_MODE, late_ns=1)
     assert SETPOINT not in rig.run(60, deaf=True)
     assert any("closed the connection" in event.text for event in rig.memory.of(Event)) == (why == "hung-up")
@@ -149,7 +149,7 @@ def test_a_silent_vehicle_is_reported_and_its_landing_is_sent() -> None:
     rig = LoopRig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
-    reported = rig.loop.refused("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
+    reported = rig.loop.add_refusals("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
     assert [event.code for event in reported] == ["went-silent"]
     assert LAND in rig.run(70, stop=True, deaf=True)  # no word of a pilot's was lost: it said nothing
 
@@ -159,7 +159,7 @@ def test_the_first_message_after_a_lost_connection_is_answered_with_the_pending_
     rig = LoopRig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
-    rig.loop.refused("vehicle", {"hung-up": 1}, rig.tick * TICK_NS)
+    rig.loop.add_refusals("vehicle", {"hung-up": 1}, rig.tick * TICK_NS)
     assert not {SETPOINT, LAND} & set(rig.run(70, stop=True, deaf=True))
     rig.heartbeat(OFFBOARD, late_ns=1)
     assert LAND in rig.run(2, stop=True, deaf=True)

@@ -16,8 +16,9 @@ from report_rig import omit_figures, omit_pages
 from udp_rig import assert_in_order, fly_over_udp
 
 import uavctl
+from logs.recording.file_scan import RecordedMessage
 from logs.recording.flight import FlightData
-from logs.recording.reader import RecordedMessage, read, records, walk
+from logs.recording.reader import read, read_kind, scan_recording
 from logs.recording.summary import summarise
 from uavctl.cli.app import run
 from uavctl.cli.flying import draw_page
@@ -77,7 +78,7 @@ def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest
 
 
 def test_the_recording_states_its_origin(flown: Path) -> None:
-    header = next(records(flown, Header))
+    header = next(read_kind(flown, Header))
     assert header.seed == 3 and header.design["design_id"] == header.design_id
     assert {"uavctl", "python", "numpy", "clarabel"} <= header.versions.keys()
     assert 'name = "paper"' in header.config_toml and header.cpu
@@ -122,7 +123,7 @@ def test_recover_restores_a_cut_file_with_its_exit_code(
     result = run_document(capsys, "log", "recover", str(cut), str(whole), code=3)
     # the clean file has one message more: the recorder's note of where it comes from
     assert result["lost_bytes"] > 0 and result["messages"] + 1 == sum(
-        isinstance(entry, RecordedMessage) for entry in walk(whole)
+        isinstance(entry, RecordedMessage) for entry in scan_recording(whole)
     )
     # a prefix of what was recorded, to the record; what is made for viewers is no record
     kept = list(read(whole))

@@ -20,9 +20,9 @@ from patience import LIMIT_S, wait_until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from uavctl.config import load_config
-from uavctl.daemon.engagement import compute_stop_limit_s
+from uavctl.daemon.flight_orders import compute_stop_limit_s
 from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 
@@ -38,7 +38,7 @@ def wait_for_flight(air: Scene) -> None:
 
 
 def read_decisions(air: Scene, out: str = "f") -> list[Decision]:
-    return list(records(air.folder / out / "flight.mcap", Decision))
+    return list(read_kind(air.folder / out / "flight.mcap", Decision))
 
 
 @pytest.mark.slow
@@ -70,7 +70,7 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
         assert air.ctl("land", "--vehicle", name)[0] == 0
         wait_until(lambda: air.has_landed, "the vehicle lands")
         process.communicate(timeout=LIMIT_S)
-    ordered = [c.order for i in records(air.folder / "f" / "flight.mcap", StepInput) for c in i.commands]
+    ordered = [c.order for i in read_kind(air.folder / "f" / "flight.mcap", StepInput) for c in i.commands]
     assert ordered == [Order.GOTO, Order.LAND]  # what was refused at the socket never reached a tick
     assert not list(air.control.iterdir())
 
@@ -107,11 +107,11 @@ def test_after_sigkill_without_a_landing_nothing_is_sent_and_the_vehicle_s_own_f
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=LIMIT_S)
     assert "left the vehicle in flight" in errors and "uavctl ctl engage" in errors
-    orders = [c.order for i in records(air.folder / "again" / "flight.mcap", StepInput) for c in i.commands]
+    orders = [c.order for i in read_kind(air.folder / "again" / "flight.mcap", StepInput) for c in i.commands]
     assert orders == [Order.STAND_BY, Order.ENGAGE]
     sent = [
         message.get_type()
-        for datagram in records(air.folder / "again" / "flight.mcap", Datagram)
+        for datagram in read_kind(air.folder / "again" / "flight.mcap", Datagram)
         if datagram.outgoing
         for message in decode(datagram.data)
         if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
@@ -202,7 +202,7 @@ def test_a_recording_that_is_deleted_while_flying_is_reported_at_once_and_in_the
     why = result["reason"]
     assert f"warning: recording in trouble: {why}" in errors  # as it happened
     assert f"({why})" in errors and "Traceback" not in errors  # at the end
-    rest = list(records(air.folder / "f" / "flight-2.mcap", Decision))
+    rest = list(read_kind(air.folder / "f" / "flight-2.mcap", Decision))
     assert rest[-1].mode is not ControlMode.TRACK and rest[0].tick > 0  # up to its end it goes on in a new folder
 
 

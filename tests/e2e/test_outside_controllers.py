@@ -63,7 +63,7 @@ def fly_module(prepared: Prepared, plant: str, autopilot: str, took_ns: int = 0,
         observed.modes.add(watch.ticked.decision.mode)
         observed.ending = watch.loop.ending
         if took_ns and at_ns > 2_000_000_000 and watch.ticked.decision.solve is not None:
-            watch.loop.answered(took_ns)
+            watch.loop.note_solve_time(took_ns)
 
     observed.wrong = tuple(fly(prepared, config, look, path=path, lands=True).wrong)
     return observed

@@ -9,7 +9,7 @@ import pytest
 from draw_flight import draw_flight
 from soak_replay import replay_seed, tally_flights
 
-from logs.recording.reader import segment_files
+from logs.recording.reader import find_segments
 
 SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for below
 
@@ -38,7 +38,7 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
     for flight in results:
         observed.update(flight.record_counts)
     assert {f"Decision {mode}" for mode in ("wait", "track", "brake", "hold", "land", "stopped")} <= observed.keys()
-    assert max(len(segment_files(flight.path)) for flight in results) > 1
+    assert max(len(find_segments(flight.path)) for flight in results) > 1
     report = tally_flights(results)
     assert (report["replayed"], report["identical"], report["wrong"]) == (len(SEEDS), len(SEEDS), {})
 

@@ -21,7 +21,8 @@ from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.supervise import ENVELOPE_CODES, POSITION_CODES
 from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.lab.trial import TrackedFlyer, compute_excess_m, get_cached_controller, get_room_limits
-from uavctl.loop import VEHICLE, ControlLoop, make_links
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import VEHICLE, make_links
 from uavctl.mavlink.framing import scan_frames
 from uavctl.records import Event, InertialSample, Outgoing, PositionSample, Record, Send, Vec3, VehicleMotion
 

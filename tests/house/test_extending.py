@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from places import ROOT, without_pages
 
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from uavctl.records import Event, Truth
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -145,7 +145,7 @@ def test_a_fault_happens(tmp_path: Path) -> None:
     recipe, (flight,), touched = run_recipe("A fault", tmp_path)
     assert touched == 2
     document = json.loads(recipe.run(f"{flight} --json"))
-    amiss = {truth.at_ns: truth.faults for truth in records(recipe.work / document["recording"], Truth)}
+    amiss = {truth.at_ns: truth.faults for truth in read_kind(recipe.work / document["recording"], Truth)}
     assert amiss[min(amiss)] == ()
     assert amiss[max(amiss)] == ("calm",)
 
@@ -155,7 +155,7 @@ def test_a_monitor_releases_the_vehicle(tmp_path: Path) -> None:
     recipe, (flight,), touched = run_recipe("A monitor", tmp_path)
     assert touched == 4
     document = json.loads(recipe.run(f"{flight} --json || test $? = 1"))
-    events = list(records(recipe.work / document["recording"], Event))
+    events = list(read_kind(recipe.work / document["recording"], Event))
     (released,) = [event for event in events if event.code == "envelope-speed"]
     landed = next(event for event in events if event.code == "fallback-land")
     assert landed.at_ns - released.at_ns < 1_000_000_000

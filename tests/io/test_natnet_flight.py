@@ -20,7 +20,7 @@ from patience import LIMIT_S, wait_until
 from process_rig import child_of
 from sim_rig import decode
 
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from sim.cameras import UPTIME_S
 from uavctl.cli.app import run
 from uavctl.event_codes import EventCode
@@ -64,7 +64,7 @@ def test_it_flies_on_a_body_of_motive_s_and_replays_without_it() -> None:
         recording = air.folder / "f" / "flight.mcap"
 
         def tracking() -> int:
-            return sum(one.mode is ControlMode.TRACK for one in records(recording, Decision))
+            return sum(one.mode is ControlMode.TRACK for one in read_kind(recording, Decision))
 
         with seen_by_motive(air) as server, end_process(air.fly("f")) as process:
             wait_until(recording.exists, "it records")
@@ -73,7 +73,7 @@ def test_it_flies_on_a_body_of_motive_s_and_replays_without_it() -> None:
             _, told = process.communicate(timeout=LIMIT_S)
         assert process.returncode == 0, told
         wait_until(lambda: air.has_landed, "the vehicle lands")
-        samples = [one for step in records(recording, StepInput) for one in step.samples]
+        samples = [one for step in read_kind(recording, StepInput) for one in step.samples]
         assert {one.source for one in samples} == {"ODOMETRY 246/197"}
         # The body was where the vehicle went, whatever the clocks say.
         way = np.array([one.position_m for one in air.truths])
@@ -91,7 +91,7 @@ def test_it_flies_on_after_a_forged_answer_and_after_the_death_of_the_process(au
         recording = air.folder / "f" / "flight.mcap"
 
         def count_tracking() -> int:
-            return sum(decision.mode is ControlMode.TRACK for decision in records(recording, Decision))
+            return sum(decision.mode is ControlMode.TRACK for decision in read_kind(recording, Decision))
 
         def is_tracking_on(more: int) -> bool:
             return count_tracking() >= more
@@ -105,7 +105,9 @@ def test_it_flies_on_after_a_forged_answer_and_after_the_death_of_the_process(au
             wait_until(lambda: is_tracking_on(flown + 40), "it flies on after the forged answer")
             assert child_of(process.pid, "uavctl.io.camera_host") == child
             os.kill(child, signal.SIGKILL)
-            wait_until(lambda: any(e.code == EventCode.PROCESS_ENDED for e in records(recording, Event)), "it is told")
+            wait_until(
+                lambda: any(e.code == EventCode.PROCESS_ENDED for e in read_kind(recording, Event)), "it is told"
+            )
             flown = count_tracking()
             wait_until(lambda: is_tracking_on(flown + 40), "it flies on after the death of the process")
             process.send_signal(signal.SIGINT)

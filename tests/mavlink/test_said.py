@@ -56,7 +56,7 @@ def test_a_recorded_refusal_reaches_the_console_as_it_is_heard() -> None:
     begun_ns = 0
     for at_ns, data in packets("arducopter-refusal.tlog"):
         begun_ns = begun_ns or at_ns
-        for event in loop.receive("vehicle", data, at_ns).news:
+        for event in loop.receive("vehicle", data, at_ns).console_events:
             line = message_filter.format_line(event, HandoverState.ARMING)
             if line is not None:
                 lines[line] = (at_ns - begun_ns) * 1e-9

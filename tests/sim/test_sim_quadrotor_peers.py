@@ -13,7 +13,7 @@ from sim_rig import ARM, TAKE_OFF, SimRig
 from soak_mission import LINK
 from udp_rig import assert_in_order, fly_over_udp
 
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from logs.recording.summary import summarise
 from sim.simulation import Peers
 from sim.vehicle.quadrotor import Quadrotor
@@ -65,7 +65,7 @@ def test_over_udp_preset_room_flies_it_in_real_time(autopilot: str, mode: str, t
     assert summary["steps"] >= 15
     assert summary["failed_solves"] == summary["input_violations"] == summary["recorder_dropped"] == 0
     assert_in_order(tmp_path / "f" / "flight.mcap", 50_000_000)
-    assert {one.mode for one in records(tmp_path / "f" / "flight.mcap", Truth)} == {mode}
+    assert {one.mode for one in read_kind(tmp_path / "f" / "flight.mcap", Truth)} == {mode}
 
 
 def test_the_seed_is_that_of_the_gusts_and_calm_air_needs_none() -> None:

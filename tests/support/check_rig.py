@@ -14,7 +14,7 @@ from sim.simulation import VEHICLE, Peers
 from uavctl.check.findings import Item, ItemState
 from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
-from uavctl.loop import make_links
+from uavctl.mavlink.connection import make_links
 from uavctl.records import discard
 
 TICK_NS, S = 50_000_000, 1_000_000_000

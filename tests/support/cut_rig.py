@@ -16,7 +16,7 @@ from mcap import records
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from logs.recording.reader import segment_files
+from logs.recording.reader import find_segments
 from uavctl.cli.app import run
 
 NAME = "flight.mcap"
@@ -55,7 +55,7 @@ class Cuts:
     """
 
     def __init__(self, flight: Path) -> None:
-        self.files = segment_files(flight)
+        self.files = find_segments(flight)
         self.chunks = list(_chunks(self.files))
         self._sizes = [file.stat().st_size for file in self.files]
         self.straddled = 0

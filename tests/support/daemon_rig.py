@@ -32,9 +32,9 @@ class DaemonRig:
         self.told: list[tuple[str, int]] = []  # words for a person, and when they were told
         self.arrives: list[tuple[int, bytes]] = []  # what comes between ticks
         self.services: list[AfterTick] = [
-            lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.news)
+            lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.console_events)
         ]
-        self.engagement: AfterTick = lambda *_: None
+        self.give_orders: AfterTick = lambda *_: None
         self.oversleep: dict[int, int] = {}  # deadline -> how much later the sleep ends
 
     def tell(self, news: Sequence[Event]) -> None:
@@ -60,7 +60,7 @@ class DaemonRig:
             lambda: self.now_ns >= stop_at_s * SECOND,
             duration_s=duration_s,
             stop_limit_s=stop_limit_s,
-            engagement=self.engagement,
+            give_orders=self.give_orders,
             after_tick=self.services,
             on_events=self.tell,
             wait_for=self.wait,

@@ -12,8 +12,9 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from recording_fakes import HEADER, Clock, Item, drop_recorder_notes, flight
 
+from logs.recording.file_scan import RecordedMessage, scan_file
 from logs.recording.info import RecordingInfo, read_info
-from logs.recording.reader import RecordedMessage, header, read, scan
+from logs.recording.reader import read, read_header
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.topics import get_definition
@@ -48,7 +49,7 @@ class FlipTest:
         if not finished:
             self.data = self.data[: self.data.rindex(DATA_END)]
             self._path.write_bytes(self.data)
-        offsets = [item.offset for item in scan(self._path) if isinstance(item, RecordedMessage)]
+        offsets = [item.offset for item in scan_file(self._path) if isinstance(item, RecordedMessage)]
         self._most = max(Counter(offsets).values())  # messages in one chunk
         self._info = read_info(self._path)
         assert drop_recorder_notes(list(read(self._path))) == self._items and len(set(offsets)) > 3
@@ -80,7 +81,7 @@ class FlipTest:
     def look(self) -> None:
         """Header and info: the truth, or nothing, and damage is told."""
         with contextlib.suppress(RecordingError):
-            assert header(self._path) == HEADER
+            assert read_header(self._path) == HEADER
         result = read_info(self._path)
         assert result.origin in (self._info.origin, None)
         assert result.start_ns >= self._info.start_ns and result.end_ns <= self._info.end_ns

@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from recording_fakes import Item, drop_recorder_notes, flight
 
 from logs.recording.disk import make_segment_path
-from logs.recording.reader import read, segment_files
+from logs.recording.reader import find_segments, read
 from logs.recording.recorder import RECORDS as AT_ONCE
 from logs.recording.recorder import Recorder, SyncRecorder, WriteQueue
 from logs.recording.recover import recover
@@ -110,7 +110,7 @@ def _look(folder: Path, kind: str, put: int, taken: int, items: list[Item]) -> K
     path, out = folder / "flight.mcap", folder / "out.mcap"
     files, kept, wrong = 0, 0, ""
     if path.exists() and path.stat().st_size:
-        files = len(segment_files(path))
+        files = len(find_segments(path))
         direct = drop_recorder_notes(list(read(path)))
         kept = len(direct)
         recover(path, out)

@@ -19,7 +19,8 @@ from logs.recording.flight import FlightData
 from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.check.preflight import Preflight
 from uavctl.config import Config, load_config
-from uavctl.loop import VEHICLE, ControlLoop, make_links
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import VEHICLE, make_links
 from uavctl.records import Command, Event, VehicleStatus, discard
 
 FLIGHTS = DATA / "flights"
@@ -120,10 +121,10 @@ def listen(
             while waiting and waiting[0][0] <= now_ns:
                 assert loop.order(waiting.popleft()[1])
             ticked = loop.tick(tick, now_ns, discard)
-            news += ticked.news
+            news += ticked.console_events
             notices += ticked.notices
             tick += 1
-        news += loop.receive(VEHICLE, datagram.data, datagram.at_ns).news
+        news += loop.receive(VEHICLE, datagram.data, datagram.at_ns).console_events
     return LoopRecord(name, loop, memory, news, notices)
 
 

@@ -54,7 +54,7 @@ class SignatureChannel:
             new = gate.refused - self.told[name]
             self.told[name] = Counter(gate.refused)
             if new:
-                loop.refused(name, dict(new), at_ns)
+                loop.add_refusals(name, dict(new), at_ns)
 
 
 @dataclass

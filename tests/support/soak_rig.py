@@ -12,7 +12,7 @@ from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
 from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
-from uavctl.daemon.engagement import compute_stop_limit_s
+from uavctl.daemon.flight_orders import compute_stop_limit_s
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,

@@ -12,5 +12,12 @@ def ticked(at_ns: int, *, answers: tuple[tuple[Command, Event], ...] = ()) -> Ti
         plan_index=None, solve=None, input=None, fresh=0, missed_ticks=0, accepted=0, rejected=0, reason="",
     )  # fmt: skip
     return Ticked(
-        decision=decision, estimate=None, link=None, vehicle=None, answers=answers, news=(), notices=(), step_ns=0
+        decision=decision,
+        estimate=None,
+        link=None,
+        vehicle=None,
+        answers=answers,
+        console_events=(),
+        notices=(),
+        step_ns=0,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from patience import LIMIT_S, wait_until
 from places import without_pages
 
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from uavctl.records import ControlMode, Decision, Setpoint, Truth
 
 # The machine may stand still for a while: that is no failsafe of the vehicle's.
@@ -32,9 +32,9 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
         if not recording.exists():
             return False
         planned = sum(
-            decision.boundary and decision.mode is ControlMode.TRACK for decision in records(recording, Decision)
+            decision.boundary and decision.mode is ControlMode.TRACK for decision in read_kind(recording, Decision)
         )
-        truths = list(records(recording, Truth))
+        truths = list(read_kind(recording, Truth))
         return planned >= 15 and bool(truths) and enough(truths)
 
     with subprocess.Popen(
@@ -53,10 +53,10 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
 
 def assert_in_order(recording: Path, dt_ns: int) -> None:
     """Assert that no tick and no step is missing, and that the vehicle flew the setpoints."""
-    decisions, truths = list(records(recording, Decision)), list(records(recording, Truth))
+    decisions, truths = list(read_kind(recording, Decision)), list(read_kind(recording, Truth))
     assert sum(1 + decision.missed_ticks for decision in decisions) == decisions[-1].tick + 1
     assert {after.at_ns - before.at_ns for before, after in pairwise(truths)} == {dt_ns}
-    setpoints = np.array([(0.0, 0.0, 0.0), *(setpoint.accel_mps2 for setpoint in records(recording, Setpoint))])
+    setpoints = np.array([(0.0, 0.0, 0.0), *(setpoint.accel_mps2 for setpoint in read_kind(recording, Setpoint))])
     flown = np.unique([truth.input for truth in truths], axis=0)
     assert flown.any()
     for applied in flown:

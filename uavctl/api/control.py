@@ -121,7 +121,7 @@ def get_limits(config: Config) -> tuple[list[tuple[float, float]], list[tuple[fl
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan(Answer):
+class SolvedPlan(Answer):
     """The answer of `solve`, with its configuration."""
 
     config: Config = field(kw_only=True)
@@ -141,7 +141,7 @@ class Plan(Answer):
         return f"{first_line}\n  first input: {first_input}\n  looks {horizon_s:g} s ahead ({self.config.name})"
 
 
-def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> Plan:
+def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> SolvedPlan:
     """Solve one decision problem: the plan from a state to the configured target.
 
     The solver of a configuration is kept for the next call.
@@ -161,7 +161,7 @@ def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> 
     n_x = design.plant.n_x
     target_state = design.target if target is None else make_state(target, n_x)
     answer = solver.solve(0, make_state(state, n_x), target_state)
-    return Plan(**{entry.name: getattr(answer, entry.name) for entry in fields(Answer)}, config=loaded)
+    return SolvedPlan(**{entry.name: getattr(answer, entry.name) for entry in fields(Answer)}, config=loaded)
 
 
 @lru_cache(maxsize=8)

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 import numpy as np
 
-from logs.recording.disk import refuse_recording_path
 from logs.recording.ends import create_recording, describe_ending
 from logs.recording.export import list_tables, read_table
 from logs.recording.flight import FlightData
-from logs.recording.reader import header, lacks_end, records
+from logs.recording.output_files import refuse_recording_path
+from logs.recording.reader import explain_missing_end, read_header, read_kind
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
-from uavctl.api.control import Plan, Runs, Signal, Source, get_limits, list_signals, load, resolve_config
+from uavctl.api.control import Runs, Signal, SolvedPlan, Source, get_limits, list_signals, load, resolve_config
 from uavctl.arrays import Array
 from uavctl.build.controller import build_flight_design, build_problem, prepare
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
-from uavctl.daemon.engagement import Engagement, check_places, compute_stop_limit_s, make_goto_keys
+from uavctl.daemon.flight_orders import FlightOrders, check_places, compute_stop_limit_s, make_goto_keys
 from uavctl.errors import RecordingError, UsageError, in_words, need
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
@@ -59,7 +59,7 @@ class Recording:
         Raises:
             RecordingError: The recording has no header.
         """
-        return parse_recorded(header(self.path).config_toml, f"{self.path} (configuration)").config
+        return parse_recorded(read_header(self.path).config_toml, f"{self.path} (configuration)").config
 
     @cached_property
     def data(self) -> FlightData:
@@ -137,7 +137,7 @@ def read(path: str | Path, *, torn: bool = False) -> Recording:
         RecordingError: There is none, it is damaged, or it has no end and `torn` is not set.
     """
     path = Path(path)
-    end_problem = lacks_end(path)
+    end_problem = explain_missing_end(path)
     if end_problem and not torn:
         raise RecordingError(
             f"{path}: {end_problem}; read(path, torn=True) reads it as far as it goes, `uavctl log recover` restores it"
@@ -197,21 +197,21 @@ def fly(
     flight_config = load(resolve_config(config), {key: value for key, value in keys.items() if value is not None})
     check_length(flight_config)
     design = build_flight_design(flight_config)
-    engagement = Engagement(flight_config, take_off_m=take_off_m, goto=goto is not None)
-    check_places(flight_config, design, take_off_m, engagement.goal)
+    orders = FlightOrders(flight_config, take_off_m=take_off_m, goto=goto is not None)
+    check_places(flight_config, design, take_off_m, orders.goal)
     prepared = prepare(flight_config, design)
     with create_recording(None if out is None else Path(out), flight_config.name, flight_config.log.free_bytes) as path:
         flight = LockstepFlight(prepared, path, command="uavctl.fly")
-        engagement.begin(flight.loop)
+        orders.begin(flight.loop)
         landing_s = None if take_off_m is None else compute_stop_limit_s(flight_config, takes_off=True)
         try:
-            flight.fly(lambda _: True, observer=engagement, landing_s=landing_s)
+            flight.fly(lambda _: True, observer=orders, landing_s=landing_s)
         except Exception as error:
             flight.loop.account.control_error = in_words(error)
             raise
         finally:
             status = flight.close()
-    truth = tuple(records(path, Truth))
+    truth = tuple(read_kind(path, Truth))
     return Flight(
         config=flight_config,
         ending=describe_ending(flight.loop.ending, status),
@@ -225,11 +225,12 @@ def fly(
 _QUANTILES = (0.05, 0.5, 0.95)
 
 
-def plot(what: Plan | Runs | Flight | Recording) -> Figure:
+def plot(what: SolvedPlan | Runs | Flight | Recording) -> Figure:
     """Draw a plan, runs or a flight, with names, units and limits; the figure is returned, not shown.
 
-    Plan: predicted states and inputs, and where it ends. Runs: median of each position (of each state, where a plant
-    has no axes), and between which two values nine in ten runs are. Flight: the path from above and from the side.
+    SolvedPlan: predicted states and inputs, and where it ends. Runs: median of each position (of each state, where a
+    plant has no axes), and between which two values nine in ten runs are. Flight: the path from above and from the
+    side.
 
     Raises:
         UsageError: It has no figure.
@@ -238,7 +239,7 @@ def plot(what: Plan | Runs | Flight | Recording) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    if isinstance(what, Plan):
+    if isinstance(what, SolvedPlan):
         _draw_plan(figure, what)
     elif isinstance(what, Runs):
         _draw_runs(figure, what)
@@ -277,7 +278,7 @@ def _group_panels(
     return list(panels.values())
 
 
-def _draw_plan(figure: Figure, plan: Plan) -> None:
+def _draw_plan(figure: Figure, plan: SolvedPlan) -> None:
     if not plan.inputs.size:
         raise UsageError(f"there is no plan to draw: {plan!r}")
     (states, inputs), (state_limits, input_limits) = list_signals(plan.config), get_limits(plan.config)

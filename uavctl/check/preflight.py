@@ -38,7 +38,7 @@ class Preflight:
     """One check; implements `uavctl.records.Flyer`.
 
     Args:
-        make_links: makes the links (`uavctl.loop.make_links`).
+        make_links: makes the links (`uavctl.mavlink.connection.make_links`).
         take_off_m: height of the climb that is planned [m].
     """
 

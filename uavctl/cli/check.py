@@ -43,7 +43,7 @@ from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
 from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
-from uavctl.loop import make_links
+from uavctl.mavlink.connection import make_links
 from uavctl.records import Checked, Datagram, Sink
 from uavctl.smpc.conditioned.planner import ConditionedDesign
 

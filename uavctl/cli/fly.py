@@ -49,12 +49,13 @@ from uavctl.config import LoadedConfig
 from uavctl.config.connections import find_security_warnings
 from uavctl.daemon.control_socket import find_control_folder, make_daemon_name, open_listener
 from uavctl.daemon.daemon import fly as run_daemon
-from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
+from uavctl.daemon.flight_orders import FlightOrders, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.landing_guard import guard_landing
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.daemon.tick_limit import limit_ticks
 from uavctl.io.signed_connection import open_links
-from uavctl.loop import VEHICLE, ControlLoop
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import VEHICLE
 
 
 def fly(
@@ -136,7 +137,7 @@ def fly_daemon(
         UavctlError: Nothing was flown; the message is the reason.
     """
     config = loaded.config
-    engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
+    orders = FlightOrders(config, take_off_m=take_off_m, goto=goto, follower=follower)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     # The lock comes first: it refuses a second daemon at once.
     with (
@@ -147,7 +148,7 @@ def fly_daemon(
     ):
         with locate_design_errors(loaded):
             design = build_flight_design(config)
-            check_places(config, design, take_off_m, engagement.goal)
+            check_places(config, design, take_off_m, orders.goal)
             prepared = prepare(config, design)
         # Loaded late: it takes an eighth of the loading time of `fly`.
         from uavctl.cli.check import check_before_arming, make_mission_items, record_items, record_parameters
@@ -166,7 +167,7 @@ def fly_daemon(
                 checked = check_before_arming(config, connections, stopped, take_off_m, parameters, mission_items)
             recorder = Recorder(path, config.log, derived_topics=viewers)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
-            engagement.begin(loop)
+            orders.begin(loop)
             is_stop_requested = False
             try:
                 put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
@@ -191,8 +192,8 @@ def fly_daemon(
                         Ticker(tick_ns, dt_ns),
                         stopped,
                         duration_s=duration_s,
-                        stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
-                        engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
+                        stop_limit_s=compute_stop_limit_s(config, takes_off=orders.takes_off),
+                        give_orders=lambda ticked, _: orders.handle_tick(loop, ticked),
                         after_tick=(
                             *guard_functions,
                             feed.after_tick,

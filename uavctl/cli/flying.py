@@ -1,4 +1,4 @@
-"""Common parts of the flights of `fly` and `loopback`: options of engagement, signals, viewers and the summary."""
+"""Common parts of the flights of `fly` and `loopback`: orders, signals, viewers and the summary."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, label_text, print_message
 from uavctl.cli.signals import SIGNAL_EXIT_BASE
-from uavctl.daemon.engagement import make_goto_keys
+from uavctl.daemon.flight_orders import make_goto_keys
 from uavctl.errors import ConnectionClosedError, RecordingError, TickOverdueError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, Ending, Order

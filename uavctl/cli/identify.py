@@ -14,8 +14,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import FileKind, detect_kind, refuse_recording_path, write_atomically
-from logs.recording.reader import header, lacks_end, read
+from logs.recording.file_kind import FileKind, detect_kind
+from logs.recording.output_files import refuse_recording_path, write_atomically
+from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import build_flight_design
@@ -84,8 +85,8 @@ def _read_history(flight: Path, common: Common, system: int | None) -> tuple[Fli
         raise UsageError("--system is for a .tlog: a recording of ours is of one vehicle")
     if common.overrides or common.config != DEFAULTS.config:
         raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
-    config = parse(header(flight).config_toml, f"{flight} (configuration)").config
-    if cut := lacks_end(flight):
+    config = parse(read_header(flight).config_toml, f"{flight} (configuration)").config
+    if cut := explain_missing_end(flight):
         warn(f"{cut}: identified from what comes before")
     return read_recorded_history(read(flight)), config
 

@@ -68,7 +68,7 @@ class MessageFilter:
 MAX_EVENTS = 64  # unshown events of the vehicle and the core
 
 
-MAX_NOTICES = 100  # unshown notices of the hand-over
+MAX_NOTICES = 100  # unshown notices
 
 
 REFRESH_S = 0.25
@@ -84,7 +84,7 @@ class LiveFeed:
     Attributes:
         ticked: The last tick; None before the first.
         events: Events of the vehicle and the core, not shown yet.
-        notices: Notices of the hand-over, not shown yet.
+        notices: Events to be shown each, not shown yet.
     """
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class LiveFeed:
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """Keep a tick, and queue its messages."""
         del lateness_ns
-        self.events.extend(ticked.news)
+        self.events.extend(ticked.console_events)
         self.notices.extend(ticked.notices)
         self.ticked = ticked
 
@@ -152,7 +152,7 @@ def show_live_line(
 
 
 def print_notices(notices: deque[Event], console: Console) -> None:
-    """Print and remove the notices of the hand-over: each transition that is a warning."""
+    """Print and remove the notices."""
     while notices:
         event = notices.popleft()
         style = "bold red" if event.severity is Severity.ERROR else "bold yellow"

@@ -15,14 +15,15 @@ from rich.table import Table
 from rich.text import Text
 
 from logs.recording.attachments import make_layout_text
-from logs.recording.disk import FileKind, detect_kind
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
+from logs.recording.file_kind import FileKind, detect_kind
+from logs.recording.file_scan import RecordedMessage
 from logs.recording.foreign import read_foreign_flight
 from logs.recording.info import PositionLoss, RecordingInfo
 from logs.recording.info import read_info as read_info
-from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, rate_of
+from logs.recording.mavlink_flight import MavlinkFlightInfo, format_rate, list_facts
 from logs.recording.parameters import VehicleParameter, count_parameters
-from logs.recording.reader import RecordedMessage, lacks_end
+from logs.recording.reader import explain_missing_end
 from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as recover_recording
 from logs.recording.summary import count
@@ -71,7 +72,7 @@ def export(
         Common(json=json).show("log/export", exported, lambda: _render_tables(exported, folder))
         for topic, number in exported.unknown.items():
             warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
-    if cut := lacks_end(flight):
+    if cut := explain_missing_end(flight):
         warn(f"{cut}: exported up to there")
     return 0
 
@@ -114,8 +115,8 @@ _SHOWN_PARAMETERS = 4
 
 
 def _render_tlog_info(flight_info: MavlinkFlightInfo) -> RenderableType:
-    rows = ((Text(name), str(number), rate_of(flight_info, name)) for name, number in flight_info.messages.items())
-    lines = [f"{name}: {value}" for name, value in facts_of(flight_info)]
+    rows = ((Text(name), str(number), format_rate(flight_info, name)) for name, number in flight_info.messages.items())
+    lines = [f"{name}: {value}" for name, value in list_facts(flight_info)]
     return Group(
         make_table("", ("message", "number", "rate"), rows, fold=True), *map(Text, (*lines, *flight_info.notes))
     )

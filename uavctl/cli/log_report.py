@@ -14,11 +14,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import FileKind, refuse_recording_path, write_atomically
+from logs.recording.file_kind import FileKind
 from logs.recording.flight import FlightData
 from logs.recording.foreign import read_foreign_flight
-from logs.recording.mavlink_flight import MavlinkFlight, facts_of
-from logs.recording.reader import lacks_end, read
+from logs.recording.mavlink_flight import MavlinkFlight, list_facts
+from logs.recording.output_files import refuse_recording_path, write_atomically
+from logs.recording.reader import explain_missing_end, read
 from logs.recording.summary import make_summary_table, make_value_table, summarise
 from logs.recording.ulog import is_ulog
 from logs.report.compare import ComparedFlight, FlightComparison, compare_flights, load_flights
@@ -144,7 +145,7 @@ def report(
     if svg is not None:
         write_atomically(svg, draw_overview(data))
     write_report(data, summary, page, verdicts)
-    if cut := lacks_end(flight):
+    if cut := explain_missing_end(flight):
         warn(f"{cut}: shown up to there")
     headline = derive_headline(data, summary, verdicts)
     document = {**msgspec.structs.asdict(summary), "verdicts": verdicts.verdicts, "headline": headline.document()}
@@ -170,6 +171,6 @@ def _report_foreign(flight: Path, foreign: MavlinkFlight, out: Path, svg: Path |
     headline = derive_tlog_headline(foreign)
     document = {**msgspec.to_builtins(foreign.info), "report": str(out), "headline": headline.document()}
     kind = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
-    facts: list[tuple[str, object]] = [*facts_of(foreign.info), ("page", str(out))]
+    facts: list[tuple[str, object]] = [*list_facts(foreign.info), ("page", str(out))]
     common.show(f"log/report-{kind}", document, lambda: _render_report(headline, make_pair_table("", facts)))
     return 0

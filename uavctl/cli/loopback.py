@@ -49,7 +49,7 @@ from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import fly
-from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
+from uavctl.daemon.flight_orders import FlightOrders, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.realtime import control_garbage_collection
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import open_links
@@ -127,19 +127,19 @@ def fly_simulated(
     check_length(config)
     with locate_design_errors(loaded):
         design = build_flight_design(config)
-    engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
+    orders = FlightOrders(config, take_off_m=take_off_m, goto=goto, follower=follower)
     with open_viewers(view_port) as viewers, create_recording(out, config.name, config.log.free_bytes) as path:
         with locate_design_errors(loaded):
-            check_places(config, design, take_off_m, engagement.goal)
+            check_places(config, design, take_off_m, orders.goal)
             prepared = prepare(config, design)
-        return _fly_real_time(prepared, path, engagement, viewers) if udp else fly_lockstep(prepared, path, engagement)
+        return _fly_real_time(prepared, path, orders, viewers) if udp else fly_lockstep(prepared, path, orders)
 
 
-def fly_lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
+def fly_lockstep(prepared: Prepared, path: Path, orders: FlightOrders) -> FlightSummary:
     """Fly in virtual time, with a progress bar."""
     config = prepared.config
     flight = LockstepFlight(prepared, path)
-    engagement.begin(flight.loop)
+    orders.begin(flight.loop)
     try:
         with (
             record_failure(flight.loop),
@@ -152,23 +152,23 @@ def fly_lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> Flig
                 progress.update(task, completed=flown_s)
                 return not stopped()
 
-            landing_s = compute_stop_limit_s(config, takes_off=True) if engagement.takes_off else None
-            flight.fly(show, observer=engagement, landing_s=landing_s)
+            landing_s = compute_stop_limit_s(config, takes_off=True) if orders.takes_off else None
+            flight.fly(show, observer=orders, landing_s=landing_s)
     finally:
         status = flight.close()
         print_ending(describe_ending(flight.loop.ending, status))
     return conclude_flight(path, flight.wall_s, status, flight.loop.ending)
 
 
-def _fly_real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: DerivedTopics) -> FlightSummary:
-    config, takes_off = prepared.config, engagement.takes_off
+def _fly_real_time(prepared: Prepared, path: Path, orders: FlightOrders, viewers: DerivedTopics) -> FlightSummary:
+    config, takes_off = prepared.config, orders.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
         connections = stack.enter_context(open_links(config))
         recorder = Recorder(path, config.log, derived_topics=viewers)
         loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
-        engagement.begin(loop)
+        orders.begin(loop)
         loop.account.ends_in_flight = not takes_off
         wall_s = 0.0
         try:
@@ -188,7 +188,7 @@ def _fly_real_time(prepared: Prepared, path: Path, engagement: Engagement, viewe
                     stopped,
                     duration_s=config.duration_s,
                     stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
-                    engagement=lambda ticked, _: engagement.handle_tick(loop, ticked),
+                    give_orders=lambda ticked, _: orders.handle_tick(loop, ticked),
                     after_tick=(feed.after_tick, lambda *_: recorder.catch_up(), collector.after_tick),
                     on_events=feed.events.extend,
                 )

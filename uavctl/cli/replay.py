@@ -16,7 +16,8 @@ from uavctl.cli.common import DEFAULTS, Common, Flight, System, locate_design_er
 from uavctl.cli.replay_table import make_foreign_table, make_replay_table
 from uavctl.cli.replays import read_foreign_vehicle, replay_flight
 from uavctl.errors import UsageError
-from uavctl.loop import VEHICLE, ControlLoop
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import VEHICLE
 
 
 def replay(

@@ -11,7 +11,7 @@ import msgspec
 
 from logs.recording.foreign import read_foreign_packets
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import good_messages, header, lacks_end, last_note, records
+from logs.recording.reader import explain_missing_end, read_header, read_kind, read_last_note, read_messages
 from logs.recording.replay import LAST_BITS, MAKERS, ReplayResult
 from logs.recording.replay import replay as replay_recording
 from logs.recording.senders import choose_vehicle
@@ -32,7 +32,8 @@ from uavctl.cli.common import locate_design_errors, warn
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse_recorded
 from uavctl.errors import DesignError, RecordingError, UsageError
-from uavctl.loop import ControlLoop, make_links
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import make_links
 from uavctl.records import Header, StepInput
 
 _LIBRARY_VERSION = "uavctl 0.2.0, commit b5d416b"  # replays flights of version 0.1 and its own with a policy library
@@ -49,7 +50,7 @@ def make_recorded_controller(flight: Path, config: Config) -> Prepared:
     except DesignError as error:
         if error.key != CONTROLLER_KEY:
             raise
-        flown_controller = header(flight).versions.get(CONTROLLER, config.smpc.controller)
+        flown_controller = read_header(flight).versions.get(CONTROLLER, config.smpc.controller)
         raise RecordingError(
             f"{flight}: was flown by a controller of another package, {flown_controller}, which is not here: "
             f"{error.reason}; {error.hint}"
@@ -100,12 +101,12 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         UsageError: An override changes the connections of the recorded bytes.
     """
     check_first_file(flight)
-    recorded = header(flight)
+    recorded = read_header(flight)
     match_arithmetic(recorded)
     name = f"{flight} (configuration)"
     config = flown_config = parse_recorded(recorded.config_toml, name).config
-    end_problem, note = lacks_end(flight), last_note(flight)
-    if end_problem and next(records(flight, StepInput), None) is None:
+    end_problem, note = explain_missing_end(flight), read_last_note(flight)
+    if end_problem and next(read_kind(flight, StepInput), None) is None:
         empty_result = ReplayResult(decisions=0, compared=0, identical=True, first_difference=None)
         return ReplayOutcome(
             empty_result, end_problem, "", (), find_other_versions(recorded, flown_config.smpc.controller), tolerance
@@ -133,7 +134,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     if tolerance:
         ignored |= LAST_BITS
     result = replay_recording(
-        ((message.definition.topic, message.at_ns, message.data) for message in good_messages(flight)),
+        ((message.definition.topic, message.at_ns, message.data) for message in read_messages(flight)),
         lambda sink: ControlLoop(config, controller, sink, lambda: 0),
         tolerance,
         finished=not end_problem and not hole_text,
@@ -168,7 +169,7 @@ def read_foreign_vehicle(
 
 def check_first_file(flight: Path) -> None:
     """Refuse a later file of a recording: it lacks the first ticks and their final state."""
-    note = next(records(flight, RecorderNote), None)
+    note = next(read_kind(flight, RecorderNote), None)
     if note is None or note.segment == 1:
         return
     if not flight.exists():

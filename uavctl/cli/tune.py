@@ -17,9 +17,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
-from logs.recording.reader import header, lacks_end, read
+from logs.recording.output_files import write_atomically
+from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.summary import summarise
 from uavctl.build.controller import build_flight_design
 from uavctl.cause import Cause
@@ -247,7 +247,7 @@ class _FlightSettings:
         """
         lands = not simulated or take_off_m is not None
         if flight is not None:
-            flown_config = parse_recorded(header(flight).config_toml, f"{flight} (configuration)").config
+            flown_config = parse_recorded(read_header(flight).config_toml, f"{flight} (configuration)").config
             mission = msgspec.structs.replace(
                 flown_config.mission, then="land" if lands and flown_config.mission.waypoints else "hold"
             )
@@ -294,7 +294,7 @@ class _TuneRun:
         if self.folder.progress.before:
             return self._skip_step("the first flight is there")
         if self._settings.flight is not None:
-            if cut := lacks_end(self._settings.flight):
+            if cut := explain_missing_end(self._settings.flight):
                 warn(f"{cut}: identified from what comes before")
             self.folder.save_progress(before=str(self._settings.flight.absolute()))
             return 0, ""

@@ -26,8 +26,7 @@ from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.lab.tune.box_monitor import BoxMonitor
 from uavctl.lab.tune.run_folder import find_last_waypoint_steps
-from uavctl.loop import make_links
-from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.connection import MavlinkConnection, make_links
 from uavctl.records import PositionSample, Vec3, VehicleStatus
 from uavctl.smpc.plant import AXES
 

@@ -15,13 +15,14 @@ from rich.console import Group, RenderableType
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
-from logs.recording.disk import FileKind, detect_kind, write_atomically
 from logs.recording.ends import create_recording, put_header
 from logs.recording.export import count_messages
+from logs.recording.file_kind import FileKind, detect_kind
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import header, lacks_end, read
+from logs.recording.output_files import write_atomically
+from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER
@@ -114,7 +115,7 @@ def whatif(
     if seed is not None and link_name == RECORDED:
         raise UsageError("--seed is of a simulated link; add --link configured, or --link KEY=VALUE")
     check_first_file(flight)
-    recorded = header(flight)
+    recorded = read_header(flight)
     match_arithmetic(recorded)
     before = parse_recorded(recorded.config_toml, f"{flight} (configuration)").config
     loaded = change_config(before, recorded.config_toml, flight, config, overrides)
@@ -195,7 +196,7 @@ def _print_warnings(flight: Path, recorded: Header, history: RecordedFlight) -> 
     )
     if lost_records:
         texts.append(f"{count(lost_records, 'record')} missing in the recording")
-    if cut := lacks_end(flight):
+    if cut := explain_missing_end(flight):
         texts.append(f"{cut}: flown up to there")
     for text in texts:
         warn(text)

@@ -504,7 +504,7 @@ Bound = Annotated[float, Meta(gt=0, le=1e6)] | None
 
 
 class EnvelopeConfig(Section, frozen=True, kw_only=True):
-    """Bounds of what is possible in flight; beyond them the vehicle is released: level, then its own landing."""
+    """Bounds of what is possible in flight; beyond them the vehicle is let go: level, then its own landing."""
 
     outside_m: Annotated[
         Bound,

@@ -32,8 +32,8 @@ from uavctl.records import Command, Event, Order, Ticked, Vec3
 FOLDER_VARIABLE = "UAVCTL_CONTROL"
 SUFFIX = ".sock"
 MAX_LINE = 4096  # bytes of a request
-_LONGEST_NAME = 48
-_LONGEST_PATH = 107  # bytes that the kernel takes for the path of a socket
+_MAX_NAME = 48  # characters of a daemon's name
+_MAX_PATH = 107  # bytes that the kernel takes for the path of a socket
 
 
 class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -62,7 +62,7 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 def make_daemon_name(config: Config) -> str:
     """Make the name of a daemon from the names of its configuration and the vehicle's URL."""
     url = config.daemon.vehicle.replace("://", "-")
-    return re.sub(r"[^A-Za-z0-9.]+", "-", f"{config.name}-{url}").strip("-.")[:_LONGEST_NAME]
+    return re.sub(r"[^A-Za-z0-9.]+", "-", f"{config.name}-{url}").strip("-.")[:_MAX_NAME]
 
 
 def find_control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
@@ -85,9 +85,9 @@ def make_socket_path(folder: Path, name: str) -> Path:
         UsageError: the path is too long for a socket.
     """
     path = folder / f"{name}{SUFFIX}"
-    if len(os.fsencode(path)) > _LONGEST_PATH:
+    if len(os.fsencode(path)) > _MAX_PATH:
         raise UsageError(
-            f"{path}: longer than the {_LONGEST_PATH} bytes of a socket's path; choose a shorter folder with --control"
+            f"{path}: longer than the {_MAX_PATH} bytes of a socket's path; choose a shorter folder with --control"
         )
     return path
 
@@ -121,7 +121,7 @@ class ControlServer:
     """Serves one listening socket; its `after_tick` is for the daemon.
 
     Args:
-        config: for the limits of a position.
+        config: For the limits of a position.
     """
 
     def __init__(
@@ -272,12 +272,12 @@ def _prepare_folder(folder: Path) -> None:
     """Make a folder that only this user can enter, or check it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        answer = folder.lstat()
+        status = folder.lstat()
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}; choose another folder with --control") from error
-    if not stat.S_ISDIR(answer.st_mode) or answer.st_uid != os.geteuid():
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
         raise UsageError(f"{folder}: not a folder of this user; choose another one with --control")
-    if answer.st_mode & 0o077:
+    if status.st_mode & 0o077:
         raise UsageError(f"{folder}: others may enter it, and could give orders; run: chmod 700 {folder}")
 
 

@@ -27,8 +27,8 @@ from uavctl.errors import ConnectionClosedError, TickOverdueError, UavctlError
 from uavctl.event_codes import EventCode
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
-from uavctl.loop import VEHICLE, ControlLoop
-from uavctl.mavlink.connection import OVERRUN
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import OVERRUN, VEHICLE
 from uavctl.records import Event, Outgoing, Ticked
 
 READ_PAUSE_NS = 2_000_000  # after a read without data for the flight
@@ -53,7 +53,7 @@ def fly(
     *,
     duration_s: float | None = None,
     stop_limit_s: float,
-    engagement: AfterTick = lambda *_: None,
+    give_orders: AfterTick = lambda *_: None,
     after_tick: Sequence[AfterTick] = (),
     limit_tick: Callable[[], AbstractContextManager[None]] = nullcontext,
     on_events: Callable[[tuple[Event, ...]], None] = lambda _: None,
@@ -68,7 +68,7 @@ def fly(
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
         stop_limit_s: the hand-over ends after this time [s] at the latest, unless the vehicle is in the air on relayed
             positions; 0 ends without one.
-        engagement: called after each tick; gives the orders of the flight. The hand-over begins if it raises.
+        give_orders: called after each tick; gives the orders of the flight. The hand-over begins if it raises.
         after_tick: services, called in this order after each tick; their errors are reported.
         limit_tick: context of each tick; interrupts one that does not end.
         on_events: called with the events for people; must not wait.
@@ -80,11 +80,11 @@ def fly(
 
     Raises:
         ConnectionClosedError: the vehicle's connection was closed by the other side.
-        Exception: of `engagement`, after the end of the flight; of cycles that fail in a row, after a landing request.
+        Exception: of `give_orders`, after the end of the flight; of cycles that fail in a row, after a landing request.
     """
     flight = _Flight(loop, connections, ticker, on_events, wait_for, now)
     flight.stop_requested, flight.duration_s, flight.stop_limit_s = stop_requested, duration_s, stop_limit_s
-    flight.engagement, flight.services, flight.limit_tick = engagement, after_tick, limit_tick
+    flight.give_orders, flight.services, flight.limit_tick = give_orders, after_tick, limit_tick
     try:
         return flight.run()
     except ConnectionClosedError:
@@ -102,7 +102,7 @@ class _Flight:
     stop_requested: Callable[[], bool]
     duration_s: float | None
     stop_limit_s: float
-    engagement: AfterTick
+    give_orders: AfterTick
     services: Sequence[AfterTick]
     limit_tick: Callable[[], AbstractContextManager[None]]
 
@@ -125,7 +125,7 @@ class _Flight:
         self._withheld = 0  # messages to the vehicle in this cycle
         self._failed_cycles = 0  # in a row
         self._ticked: Ticked | None = None  # the last tick
-        self._engagement_error: Exception | None = None
+        self._orders_error: Exception | None = None
         self._reported_subjects: set[str] = set()
         self._reserve = bytearray(RESERVE_BYTES)
 
@@ -145,14 +145,14 @@ class _Flight:
                 self._tell(event)
             else:
                 self._failed_cycles = 0
-        if self._engagement_error is not None:
-            raise self._engagement_error
+        if self._orders_error is not None:
+            raise self._orders_error
         return self._stop_ns is not None
 
     def request_landing(self) -> None:
         """Send the landing request of a flight whose cycles have failed, until it is answered. Services go on."""
         connection = self._connections[VEHICLE]
-        quiet_tick = None if self._ticked is None else replace(self._ticked, answers=(), news=(), notices=())
+        quiet_tick = None if self._ticked is None else replace(self._ticked, answers=(), console_events=(), notices=())
         while not connection.closed and self._loop.send_landing_request(
             self._now(), lambda message: connection.send(message.data)
         ):
@@ -193,14 +193,14 @@ class _Flight:
         with self.limit_tick():
             ticked = loop.tick(due.tick, due.at_ns, self._send, due.missed, stop=self._stop_ns is not None)
         lateness_ns, send_ns = started_ns - due.at_ns, self._now() - due.at_ns
-        self._follow_engagement(ticked, lateness_ns)
+        self._handle_orders(ticked, lateness_ns)
         bookkeeping: tuple[AfterTick, ...] = (
             lambda *_: self._report_withheld(),
-            lambda *_: loop.timing(ticked, lateness_ns, send_ns),
+            lambda *_: loop.record_timing(ticked, lateness_ns, send_ns),
             lambda *_: self._reporter.report(due.at_ns),
         )
         if loop.outside and ticked.decision.solve is not None:
-            loop.answered(ticked.step_ns)
+            loop.note_solve_time(ticked.step_ns)
         self._run_services((*bookkeeping, *self.services), ticked, lateness_ns)
         self._ticked = ticked
 
@@ -229,16 +229,16 @@ class _Flight:
 
     def _report_withheld(self) -> None:
         if self._withheld:
-            self._loop.refused(VEHICLE, {WITHHELD: self._withheld}, self._now())
+            self._loop.add_refusals(VEHICLE, {WITHHELD: self._withheld}, self._now())
 
-    def _follow_engagement(self, ticked: Ticked, lateness_ns: int) -> None:
+    def _handle_orders(self, ticked: Ticked, lateness_ns: int) -> None:
         """Let the orders of the flight be given; an error begins its end."""
-        if self._engagement_error is not None:
+        if self._orders_error is not None:
             return
         try:
-            self.engagement(ticked, lateness_ns)
+            self.give_orders(ticked, lateness_ns)
         except Exception as error:  # noqa: BLE001 raised after the end
-            self._engagement_error = error
+            self._orders_error = error
             self._stop_ns = ticked.decision.at_ns if self._stop_ns is None else self._stop_ns
             self._report_error("the orders of the flight", error)
 
@@ -347,8 +347,8 @@ class _Reader:
             connection.select_peer(index)
         elif received.from_source:
             connection.trust_sender(index)
-        if received.news:
-            self._on_events(received.news)
+        if received.console_events:
+            self._on_events(received.console_events)
         for answer in received.answers:
             self._connections[answer.link].send(answer.data)
 
@@ -358,7 +358,7 @@ class _Reader:
             before, lost = self._lost[name], connection.count_lost()
             self._lost[name] = lost
             if has_stalled and lost > before:
-                self._loop.refused(name, {OVERRUN: lost - before}, self._now())
+                self._loop.add_refusals(name, {OVERRUN: lost - before}, self._now())
 
 
 class _RefusalReporter:
@@ -385,4 +385,4 @@ class _RefusalReporter:
             new_counts = refused - self._reported[name]
             if new_counts:
                 self._reported[name] = refused
-                self._on_events(self._loop.refused(name, dict(new_counts), at_ns))
+                self._on_events(self._loop.add_refusals(name, dict(new_counts), at_ns))

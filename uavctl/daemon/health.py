@@ -102,7 +102,7 @@ class MonitoredFlight(Protocol):
 
     @property
     def breach_reason(self) -> str:
-        """Reason why the envelope has released the vehicle; empty if it has not."""
+        """Reason why the envelope has let the vehicle go; empty while it has not."""
         ...
 
 
@@ -158,7 +158,7 @@ class HealthMonitor:
         self._max_lateness_ns = max(self._max_lateness_ns, lateness_ns)
         if self._flight.breach_reason and not self._breach_reason:
             self._breach_reason = self._flight.breach_reason
-            self._write_line(f"error: the vehicle is released: {self._breach_reason}")
+            self._write_line(f"error: the vehicle is let go: {self._breach_reason}")
         if at_ns - self._reported_ns >= PERIOD_NS:
             self._reported_ns = at_ns
             self._count_losses()
@@ -168,7 +168,7 @@ class HealthMonitor:
                 self._relay_rate = relay.sent, float(relay.sent - self._relay_rate[0])
             inertial = self._flight.inertial
             if inertial is not None:
-                used, total = (state - before for state, before in zip(inertial, self._inertial, strict=True))
+                used, total = (count - before for count, before in zip(inertial, self._inertial, strict=True))
                 self._inertial, self._inertial_share = inertial, used / total if total else None
             health = self.make_health()
             self._report_recorder(health.recorder)

@@ -26,10 +26,10 @@ from urllib.parse import urlsplit
 from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
-_LONGEST = 500  # bytes of a lock file that are read
-_TRIES = 10  # attempts while the last holder removes the file
+_MAX_BYTES = 500  # of a lock file that are read
+_MAX_TRIES = 10  # while the last holder removes the file
 _FLIGHT_LINE = "flown at"  # the second line, with the time since the machine's start [ns]
-LONGEST_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a battery lasts has landed
+MAX_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a battery lasts has landed
 
 
 def identify_connection(url: str) -> str:
@@ -46,10 +46,10 @@ def identify_connection(url: str) -> str:
         return f"serial {os.path.realpath(rest.rpartition(':')[0])}"  # the rate is not part of the identity
     try:
         parts = urlsplit(url)
-        status = socket.getaddrinfo(parts.hostname, parts.port)[0][4]
+        address = socket.getaddrinfo(parts.hostname, parts.port)[0][4]
     except (ValueError, OSError) as error:
         raise ConnectionSpecError(f"connection {url!r}: {error}; check host and port") from error
-    host, port = str(status[0]), int(status[1])
+    host, port = str(address[0]), int(address[1])
     return f"{scheme} {_normalise_host(host, is_local=scheme == 'udpin')} {port}"
 
 
@@ -77,8 +77,8 @@ class VehicleLock:
     def __init__(self, descriptors: Sequence[int], url: str, now: Callable[[], int] = time.monotonic_ns) -> None:
         self._descriptors, self._now = descriptors, now
         self._first_line = f"{os.getpid()} {url}\n"
-        status = [_parse_left_flight_ns(os.pread(descriptor, _LONGEST, 0), now()) for descriptor in descriptors]
-        self._left_flight_ns = max((descriptor for descriptor in status if descriptor is not None), default=None)
+        starts_ns = [_parse_left_flight_ns(os.pread(descriptor, _MAX_BYTES, 0), now()) for descriptor in descriptors]
+        self._left_flight_ns = max((start_ns for start_ns in starts_ns if start_ns is not None), default=None)
         self._write()
 
     @property
@@ -112,13 +112,13 @@ def _parse_left_flight_ns(text: bytes, now_ns: int) -> int | None:
     _, _, flight_ns = text.decode(errors="replace").partition(f"\n{_FLIGHT_LINE} ")
     at_ns = int(flight_ns.strip()) if flight_ns.strip().isdecimal() else None
     # A time in the future is from before the machine's last start.
-    return at_ns if at_ns is not None and 0 <= now_ns - at_ns <= LONGEST_FLIGHT_NS else None
+    return at_ns if at_ns is not None and 0 <= now_ns - at_ns <= MAX_FLIGHT_NS else None
 
 
 def find_lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
     """Find the lock files of the vehicle behind a URL; arguments and errors as in `lock_vehicle`."""
     name = f"uavctl-{hashlib.sha256(identify_connection(url).encode()).hexdigest()[:16]}.lock"
-    return tuple(descriptor / name for descriptor in (find_runtime_folders() if folder is None else (folder,)))
+    return tuple(base / name for base in (find_runtime_folders() if folder is None else (folder,)))
 
 
 @contextmanager
@@ -161,7 +161,7 @@ def _make_vehicle_lock(descriptors: Sequence[int], url: str, path: Path) -> Vehi
 
 def _lock_file(path: Path, url: str) -> int:
     """Lock a file and return its descriptor."""
-    for _ in range(_TRIES):
+    for _ in range(_MAX_TRIES):
         try:
             descriptor = _open_lock_file(path)
         except FileExistsError:
@@ -178,7 +178,9 @@ def _lock_file(path: Path, url: str) -> int:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise _describe_holder(descriptor, url) from None
+            taken_error = _make_taken_error(descriptor, url)
+            os.close(descriptor)
+            raise taken_error from None
         if _is_same_file(path, descriptor):
             return descriptor
         os.close(descriptor)
@@ -206,10 +208,10 @@ def _is_same_file(path: Path, descriptor: int) -> bool:
         return False
 
 
-def _describe_holder(descriptor: int, url: str) -> VehicleTakenError:
-    first_line, _, _ = os.pread(descriptor, _LONGEST, 0).decode(errors="replace").partition("\n")
+def _make_taken_error(descriptor: int, url: str) -> VehicleTakenError:
+    """Make the error that names the process which holds a locked file."""
+    first_line, _, _ = os.pread(descriptor, _MAX_BYTES, 0).decode(errors="replace").partition("\n")
     pid, _, their_url = first_line.strip().partition(" ")
-    os.close(descriptor)
     holder = f"process {pid}" if pid.isdecimal() else "another process"
     alias = f" (as {their_url})" if their_url and their_url != url else ""
     return VehicleTakenError(

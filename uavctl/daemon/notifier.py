@@ -14,7 +14,7 @@ from uavctl.errors import UsageError
 from uavctl.records import Ticked
 
 _WATCHDOG_SIGNALS = 4  # watchdog signals in one watchdog time
-_LONGEST = 2000  # characters of a status text
+_MAX_STATUS = 2000  # characters of a status text
 
 
 class Notifier:
@@ -53,7 +53,7 @@ class Notifier:
 
     def send_status(self, text: str) -> None:
         """Send a line for `systemctl status`."""
-        self._send("STATUS=" + text.replace("\n", " ")[:_LONGEST])
+        self._send("STATUS=" + text.replace("\n", " ")[:_MAX_STATUS])
 
     def close(self) -> None:
         """Send that the daemon stops; then the watchdog needs no signals."""

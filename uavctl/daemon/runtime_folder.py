@@ -19,12 +19,12 @@ TEMPORARY = Path("/tmp")
 
 
 def is_private_folder(folder: Path) -> bool:
-    """Return whether this is a folder of this user, that no other one may enter; a link to one is none."""
+    """Return whether this is a folder that only this user may enter; a link to one is none."""
     try:
-        folders = folder.lstat()
+        status = folder.lstat()
     except OSError:
         return False
-    return stat.S_ISDIR(folders.st_mode) and folders.st_uid == os.geteuid() and not folders.st_mode & 0o077
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077
 
 
 def find_runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]:

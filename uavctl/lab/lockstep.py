@@ -55,7 +55,7 @@ class _VirtualTimeLoop:
     def tick(self, tick: int, at_ns: int, send: Send) -> None:
         self.at_ns = at_ns
         ticked = self._loop.tick(tick, at_ns, send, stop=self.stop)
-        self._loop.timing(ticked, lateness_ns=0, send_ns=0)
+        self._loop.record_timing(ticked, lateness_ns=0, send_ns=0)
         if self._observer is not None:
             self._observer.handle_tick(self._loop, ticked)
 

@@ -17,7 +17,7 @@ from sim.vehicle.quadrotor import Quadrotor
 from uavctl.config import Config
 from uavctl.config.connections import RelayConfig
 from uavctl.frames import Quaternion
-from uavctl.loop import VEHICLE, make_links
+from uavctl.mavlink.connection import VEHICLE, make_links
 from uavctl.mavlink.relay import Relay
 from uavctl.records import Outgoing, PositionSample, Received, Send, Vec3
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.arrays import SECOND_NS
+from uavctl.config import Config
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.event_codes import EventCode
@@ -70,7 +71,7 @@ MAX_OPEN_REQUESTS = 8  # requests that still accept an answer
 MAX_ANSWERS, ANSWER_WINDOW_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_EVENT_NS = 10_000_000_000  # between two events about slow answers
-MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three missing heartbeats
+NO_HEARTBEAT_NS = 3 * SECOND_NS  # of positions without a heartbeat, which comes once a second
 TIMESYNC_FLOOD = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system before it was read; perhaps the newest state of the vehicle
 # Code of a lost connection: what happened, and what follows.
@@ -507,7 +508,7 @@ class MavlinkConnection:
             since_ns is not None
             and self.vehicle is None
             and not self._is_no_heartbeat_reported
-            and at_ns - since_ns >= MISSING_HEARTBEAT_NS
+            and at_ns - since_ns >= NO_HEARTBEAT_NS
         ):
             self._is_no_heartbeat_reported = True
             sender = self._no_heartbeat_address and self._no_heartbeat_address[0]
@@ -551,3 +552,29 @@ class MavlinkConnection:
             count = self._unreported.total()
             events.append(self._make_event(at_ns, Severity.WARNING, EventCode.DROPPED, text, count))
         return events
+
+
+def make_links(
+    config: Config, on_message: Callable[[Message, int], None] | None = None
+) -> dict[str, MavlinkConnection]:
+    """Make the connections' protocol states: one for both roles when the two URLs are the same.
+
+    Args:
+        on_message: Called with each decoded message of others, and its time [ns].
+    """
+    shared = config.daemon.vehicle == config.daemon.mocap
+    names = {VEHICLE: (VEHICLE, MOCAP)} if shared else {VEHICLE: (VEHICLE,), MOCAP: (MOCAP,)}
+    return {
+        name: MavlinkConnection(
+            name,
+            roles=frozenset(roles),
+            daemon=config.daemon,
+            frame=config.frame,
+            clock=config.clock,
+            source=config.source,
+            estimator=config.estimator,
+            on_message=on_message,
+            vehicle_time=config.relay.enabled and config.relay.vehicle_time,
+        )
+        for name, roles in names.items()
+    }

@@ -38,7 +38,7 @@ MISSING_HEARTBEAT_NS = 1_500_000_000  # a heartbeat is missing
 FOREVER_NS = 2**62
 _END_STATES = frozenset({HandoverState.DONE, HandoverState.FAILED})
 _ON_THE_GROUND = frozenset({HandoverState.MODE, HandoverState.ARMING})
-_MOVING_STATES = frozenset(
+_CLIMB_OR_LANDING_STATES = frozenset(
     {
         HandoverState.CLIMBING,
         HandoverState.ENGAGING,
@@ -61,7 +61,8 @@ _STATES_STORING_MODE = frozenset(
 )
 # A failsafe in one of these states, which ends itself, has only interrupted the climb.
 _CLIMB_STATES = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
-_TAKEN_OVER_STATES = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
+# States in which a failsafe, or nobody who is known, has the vehicle for a limited time.
+_INTERRUPTED_STATES = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
 _ORDER_TEXTS = {
     Order.TAKE_OFF: "will take off",
     Order.ENGAGE: "asks for the mode that takes setpoints",
@@ -132,9 +133,9 @@ class HandoverStateMachine:
         return self._progress.height_m
 
     @property
-    def has_begun(self) -> bool:
+    def is_climbing_or_landing(self) -> bool:
         """Whether the vehicle climbs or lands at our request, or by a failsafe on an ordered flight."""
-        return self.state in _MOVING_STATES
+        return self.state in _CLIMB_OR_LANDING_STATES
 
     @property
     def lands_on_request(self) -> bool:
@@ -175,8 +176,8 @@ class HandoverStateMachine:
             if self.is_ordered_flight:
                 # EXTENDED_SYS_STATE comes once a second and may still show the climb that we have ended.
                 vehicle = msgspec.structs.replace(vehicle, own_climb=False)
-            past = self._progress.may_be_outdated(vehicle)
-            return msgspec.structs.replace(vehicle, armed=True, external=True) if past else vehicle
+            is_outdated = self._progress.may_be_outdated(vehicle)
+            return msgspec.structs.replace(vehicle, armed=True, external=True) if is_outdated else vehicle
         return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} ({self.state})")
 
     def has_left_external_mode(self, vehicle: VehicleStatus) -> bool:
@@ -300,7 +301,7 @@ class HandoverStateMachine:
     def _enter_state(self, before: HandoverState, result: GuardResult, inputs: HandoverInput) -> None:
         progress = self._progress
         progress.state_start_ns, progress.is_standing_by = inputs.at_ns, False
-        if progress.state in _TAKEN_OVER_STATES and before not in _TAKEN_OVER_STATES:
+        if progress.state in _INTERRUPTED_STATES and before not in _INTERRUPTED_STATES:
             progress.is_climb_interrupted = before in _CLIMB_STATES
         if progress.state is HandoverState.FAILSAFE:
             failsafe_text = "" if inputs.vehicle is None else inputs.vehicle.said

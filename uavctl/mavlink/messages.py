@@ -77,19 +77,19 @@ class RadioChannels(Message, frozen=True, kw_only=True):
 
 
 class ModeCommand(Message, frozen=True, kw_only=True):
-    """SET_MODE or COMMAND_LONG that changes the mode, from whomever."""
+    """SET_MODE, or COMMAND_LONG that changes the mode, of any sender."""
 
-    target_system: int
+    target_system: int  # 0 is for everybody
 
 
 class StatusText(Message, frozen=True, kw_only=True):
-    """STATUSTEXT, or a piece of a long one."""
+    """STATUSTEXT, or a chunk of a long one."""
 
     severity: int  # MAV_SEVERITY, from 0 (emergency) to 7 (debug)
     text: str
-    text_id: int = 0  # of the long text that it is a piece of; 0: it is whole
-    chunk: int = 0  # which piece, from 0
-    has_more: bool = False  # another piece follows
+    text_id: int = 0  # number of the long text that this is a chunk of; 0: the text is whole
+    chunk: int = 0  # number of the chunk, from 0
+    has_more: bool = False  # another chunk follows
 
 
 class CommandAck(Message, frozen=True, kw_only=True):
@@ -102,7 +102,7 @@ class CommandAck(Message, frozen=True, kw_only=True):
 
 
 class GlobalOrigin(Message, frozen=True, kw_only=True):
-    """GPS_GLOBAL_ORIGIN: the vehicle knows its place on the globe."""
+    """GPS_GLOBAL_ORIGIN: the vehicle has a global origin of its local frame."""
 
 
 class Attitude(Message, frozen=True, kw_only=True):
@@ -117,7 +117,7 @@ class Attitude(Message, frozen=True, kw_only=True):
 class Inertial(Message, frozen=True, kw_only=True):
     """HIGHRES_IMU or RAW_IMU: specific force, body axes forward, right, down [m/s²]."""
 
-    specific_force_mps2: Vec3  # that; (0, 0, -g) at rest
+    specific_force_mps2: Vec3  # acceleration less gravity; (0, 0, -g) at rest
     raw: bool = False  # it is RAW_IMU, whose unit is the sender's own: read as ArduPilot's, thousandths of g
     stamp_us: int = 0  # by the sender's clock, since boot or an epoch; 0 if unknown
 
@@ -125,7 +125,7 @@ class Inertial(Message, frozen=True, kw_only=True):
 class ParamValue(Message, frozen=True, kw_only=True):
     """PARAM_VALUE; `cast` and `bytewise` are the two readings of the same four bytes."""
 
-    name: str  # of the parameter
+    name: str  # name of the parameter
     cast: float  # the value as a number, as ArduPilot means it
     bytewise: float  # the value as PX4 means it: the bytes of an integer, if the type is one
     index: int = 65535  # its index in the list; 65535 if unknown

@@ -21,7 +21,7 @@ from uavctl.event_codes import EventCode
 from uavctl.frames import Quaternion, rotate_vector
 from uavctl.mavlink.relay_attitude import TILTED, TURNED, AttitudeCheck
 from uavctl.mavlink.vehicle_turn import VehicleTurn
-from uavctl.records import Event, PositionSample, Severity, Vec3
+from uavctl.records import Event, PositionSample, RelayStats, Severity, Vec3
 
 MAX_AGE_NS = 200_000_000  # some estimators use an older position as a new one
 FROZEN_POSES = 25  # identical poses in a row: 0.5 s at the usual 50 Hz; noise repeats one less than twice
@@ -184,6 +184,22 @@ class Relay:
             return Event(at_ns=at_ns, severity=Severity.INFO, code=EventCode.RELAY_ATTITUDE_RIGHT, text=text)
         return None
 
+    def stats(self, at_ns: int, *, alone: bool) -> RelayStats:
+        """Return the counters since the start.
+
+        Args:
+            alone: nothing but positions is sent to the vehicle any more.
+        """
+        return RelayStats(
+            at_ns=at_ns,
+            sent=self.sent,
+            kept={reason: count for reason, count in self.kept.items() if count},
+            last_ns=self.last_ns,
+            alone=alone,
+            silent_for=self.silent_for,
+            attitude_fault=self.attitude_fault,
+        )
+
     def _find_silence_reason(self) -> str:
         counts = (Counter(self.kept) - self._kept_before).most_common(1)
         return counts[0][0] if counts else NO_POSITION
@@ -219,3 +235,18 @@ class Relay:
         # A pose without a velocity goes as a position: an unknown one (NaN) is not safe to send to ArduPilot.
         message = "vision-position-estimate" if velocity_body is None else self._config.message
         return Pose(message, (sample.captured_ns - offset_ns) // 1000, sample.position_m, attitude, velocity_body)
+
+
+def describe_relay(stats: RelayStats, last_setpoint_ns: int | None) -> str:
+    """Describe the positions passed on in a flight that has ended.
+
+    Args:
+        last_setpoint_ns: time of the last setpoint that flew the vehicle; None without one.
+    """
+    if stats.last_ns is None:
+        return "no position was passed on to the vehicle"
+    since_last_s = (stats.at_ns - stats.last_ns) * 1e-9
+    text = f"passed on {stats.sent} positions and kept {sum(stats.kept.values())} back"
+    text += f", the last one {since_last_s:.1f} s before the end"
+    after_setpoints_s = 0.0 if last_setpoint_ns is None else (stats.last_ns - last_setpoint_ns) * 1e-9
+    return f"{text}, {after_setpoints_s:.1f} s after the last setpoint" if after_setpoints_s > 0.0 else text

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from tune_rig import BOX, START, make_arguments, run_command, short_flights
 
-from logs.recording.reader import header, segment_files
+from logs.recording.reader import find_segments, read_header
 from uavctl.cli import loopback as loopback_cmd
 from uavctl.cli import tune as tune_cmd
 from uavctl.cli.app import run
@@ -75,7 +75,7 @@ def test_a_run_leaves_flights_configuration_and_pages(finished_run: Path) -> Non
 @pytest.mark.slow
 def test_all_files_of_a_recording_are_read(finished_run: Path) -> None:
     first = finished_run / BEFORE_FOLDER / "flight.mcap"
-    assert len(segment_files(first)) > 1
+    assert len(find_segments(first)) > 1
     state = json.loads((finished_run / STATE_FILE).read_text())
     assert state["comparison"]["before"]["flown_s"] > 25.0
 
@@ -83,7 +83,7 @@ def test_all_files_of_a_recording_are_read(finished_run: Path) -> None:
 @pytest.mark.slow
 def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(finished_run: Path) -> None:
     flown = [
-        parse(header(finished_run / name / "flight.mcap").config_toml, name).config
+        parse(read_header(finished_run / name / "flight.mcap").config_toml, name).config
         for name in (BEFORE_FOLDER, AFTER_FOLDER)
     ]
     tuned = load_config(str(finished_run / TUNED_FILE))
@@ -210,7 +210,7 @@ def test_a_recording_takes_the_place_of_the_first_flight(
     assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED_FILE)
     assert not (folder / BEFORE_FOLDER).exists()
     (second,) = requests
-    assert second.mission.waypoints == parse(header(flight).config_toml, "flight").config.mission.waypoints
+    assert second.mission.waypoints == parse(read_header(flight).config_toml, "flight").config.mission.waypoints
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_complete_flights_count_without_a_note(
 def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(
     finished_run: Path, tmp_path: Path
 ) -> None:
-    config = parse(header(finished_run / BEFORE_FOLDER / "flight.mcap").config_toml, "before").config
+    config = parse(read_header(finished_run / BEFORE_FOLDER / "flight.mcap").config_toml, "before").config
     assert find_complete_flight(config, finished_run / BEFORE_FOLDER) == finished_run / BEFORE_FOLDER / "flight.mcap"
     assert (
         find_complete_flight(config, finished_run / AFTER_FOLDER) is None

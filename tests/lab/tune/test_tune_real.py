@@ -9,7 +9,7 @@ import pytest
 from endings_rig import EndingRig, interrupt
 from tune_rig import TuneResult, fly_real, real_rig
 
-from logs.recording.reader import header
+from logs.recording.reader import read_header
 from uavctl.cause import CAUSES, Cause
 from uavctl.cli import tune as tune_cmd
 from uavctl.cli import tune_flights
@@ -69,7 +69,7 @@ def finished_run(folder: Path, in_the_second: tuple[TuneResult, int]) -> TuneRes
 
 
 def recorded(folder: Path, noted: str) -> str:
-    return header(folder / noted / "flight.mcap").config_toml
+    return read_header(folder / noted / "flight.mcap").config_toml
 
 
 @pytest.mark.slow

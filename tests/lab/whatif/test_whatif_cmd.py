@@ -12,7 +12,7 @@ import pytest
 from places import DATA
 from report_rig import omit_figures, omit_pages
 
-from logs.recording.reader import header
+from logs.recording.reader import read_header
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
@@ -72,7 +72,7 @@ def test_another_cost_is_recorded_reported_and_replays(
     assert result["reproduction"]["identical"] and result["largest_departure_m"] > 1.0
     assert result["what_if"]["cost"] > result["recorded"]["cost"] + 1.0
     assert result["changed"] == ["cost.input=[20.0, 20.0]"]
-    assert header(out / "flight.mcap").config_toml.count("input = [20.0, 20.0]") == 1
+    assert read_header(out / "flight.mcap").config_toml.count("input = [20.0, 20.0]") == 1
     for key, text in (("page", "<svg"), ("report", "<svg")):
         assert text in Path(result[key]).read_text(encoding="utf-8")
     code, text, _ = typed(capsys, "log", "replay", str(out / "flight.mcap"), "--json")

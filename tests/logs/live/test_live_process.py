@@ -23,7 +23,7 @@ from view_rig import fly_view
 from logs.live.process import LiveProcess, open_port
 from logs.live.server import MAX_ASKING, MAX_HEAD_BYTES, MAX_VIEWERS
 from logs.recording.derived_topics import VIEWS
-from logs.recording.reader import records
+from logs.recording.reader import read_kind
 from logs.recording.recorder import DerivedTopics, Recorder
 from logs.recording.topics import encode, get_definition
 from logs.recording.views import ViewBuilder
@@ -333,7 +333,7 @@ def check_flight(flight: subprocess.Popen[str], folder: Path) -> str:
     out, err = flight.communicate(timeout=PATIENCE_S)
     assert flight.returncode == 0, err
     assert json.loads(out)["recorder_dropped"] == 0
-    decisions = [*records(folder / "flight.mcap", Decision)]
+    decisions = [*read_kind(folder / "flight.mcap", Decision)]
     assert sum(1 + one.missed_ticks for one in decisions) == decisions[-1].tick + 1
     return err
 

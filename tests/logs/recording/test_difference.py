@@ -13,8 +13,8 @@ from loopback_rig import MemorySink, lockstep, make_loop, shared_loop
 from recording_fakes import stored_chunks
 from report_rig import omit_pages
 
-from logs.recording.reader import lacks_end, records, segment_files
-from logs.recording.replay import MAKERS, FieldNames, ReplayResult, leaves, replay
+from logs.recording.reader import explain_missing_end, find_segments, read_kind
+from logs.recording.replay import MAKERS, FieldNames, ReplayResult, find_different_leaves, replay
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run
 from uavctl.config import load_config
@@ -127,7 +127,7 @@ def test_every_bit_of_a_number_counts(left: float, right: float | None, differs:
     def setpoint(yaw_rad: float | None) -> Setpoint:
         return Setpoint(at_ns=1, accel_mps2=(0.0, 0.0, 0.0), yaw_rad=yaw_rad, source=SetpointSource.HOLD)
 
-    found = leaves(setpoint(left), setpoint(right))
+    found = find_different_leaves(setpoint(left), setpoint(right))
     assert [path for path, _, _ in found] == (["yaw_rad"] if differs else [])
 
 
@@ -137,8 +137,8 @@ def test_counts_in_another_order_are_the_same_counts() -> None:
             at_ns=1, link="v", datagrams=1, messages=1, samples=0, bad=bad, clock_offset_ns=None, clock_source="none"
         )
 
-    assert not leaves(stats({"a": 1, "b": 2}), stats({"b": 2, "a": 1}))
-    assert [path for path, _, _ in leaves(stats({"a": 1}), stats({"a": 1, "b": 2}))] == ["bad.b"]
+    assert not find_different_leaves(stats({"a": 1, "b": 2}), stats({"b": 2, "a": 1}))
+    assert [path for path, _, _ in find_different_leaves(stats({"a": 1}), stats({"a": 1, "b": 2}))] == ["bad.b"]
 
 
 def test_fields_have_names_and_units() -> None:
@@ -164,7 +164,7 @@ def rotated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rotated")
     with omit_pages():
         assert run(["loopback", *SMALL, "--duration", "25", "--out", str(folder), "--json"]) == 0
-    assert len(segment_files(folder / "flight.mcap")) > 2
+    assert len(find_segments(folder / "flight.mcap")) > 2
     return folder
 
 
@@ -175,7 +175,7 @@ def test_a_flight_in_several_files_is_replayed_from_the_first(
     flight = rotated / "flight.mcap"
     assert run(["log", "replay", str(flight), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["identical"] and found["decisions"] == sum(1 for _ in records(flight, Decision)) == 250
+    assert found["identical"] and found["decisions"] == sum(1 for _ in read_kind(flight, Decision)) == 250
     assert (found["first_difference"], found["context"], found["course"], found["changed"]) == (None, None, [], [])
 
 
@@ -193,7 +193,7 @@ def test_a_later_file_and_a_folder_are_refused_with_what_to_give(
 def test_a_recording_without_its_first_file_is_refused(
     rotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for file in segment_files(rotated / "flight.mcap")[1:]:
+    for file in find_segments(rotated / "flight.mcap")[1:]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
     assert run(["log", "replay", str(tmp_path / "flight.mcap")]) == 1
     told = capsys.readouterr().err
@@ -204,10 +204,10 @@ def test_a_recording_without_its_last_file_is_alike_up_to_there_and_says_so(
     rotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flight = tmp_path / "flight.mcap"
-    for file in segment_files(rotated / "flight.mcap")[:-1]:
+    for file in find_segments(rotated / "flight.mcap")[:-1]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    last = segment_files(flight)[-1].name
-    assert lacks_end(flight) and not lacks_end(rotated / "flight.mcap")
+    last = find_segments(flight)[-1].name
+    assert explain_missing_end(flight) and not explain_missing_end(rotated / "flight.mcap")
     assert run(["log", "replay", str(flight), "--json"]) == 0
     told = capsys.readouterr()
     assert 100 < json.loads(told.out)["decisions"] < 250
@@ -221,7 +221,7 @@ def test_a_hole_in_a_recovered_recording_is_told(
     holding = [begin for begin, _, content in stored_chunks(bytes(data)) if b"/uavctl/decision" in content]
     data[holding[len(holding) // 2] + 100] ^= 1
     (tmp_path / "flight.mcap").write_bytes(data)
-    for file in segment_files(rotated / "flight.mcap")[1:]:
+    for file in find_segments(rotated / "flight.mcap")[1:]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
     whole = tmp_path / "whole.mcap"
     assert run(["log", "recover", str(tmp_path / "flight.mcap"), str(whole)]) == 3
@@ -244,7 +244,7 @@ def test_a_changed_configuration_is_shown_with_what_it_changes(
     result = msgspec.convert({key: found[key] for key in ReplayResult.__struct_fields__}, ReplayResult)
     first, context = result.first_difference, result.context
     assert first is not None and context is not None and context.decisions_before == first.tick
-    inputs = {one.tick: one for one in records(rotated / "flight.mcap", StepInput)}
+    inputs = {one.tick: one for one in read_kind(rotated / "flight.mcap", StepInput)}
     assert context.positions == len(inputs[context.decisions_before].samples)
     assert run(command) == 1
     told = capsys.readouterr().out

@@ -20,7 +20,7 @@ from view_rig import fly_view, read_protobuf
 
 from logs.recording.export import TableFormat, export_tables
 from logs.recording.info import read_info
-from logs.recording.reader import read, walk
+from logs.recording.reader import read, scan_recording
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.tlog import export_tlog
@@ -87,7 +87,7 @@ def test_later_files_and_recovered_ones_have_the_same_times(tmp_path: Path) -> N
     assert drop_recorder_notes(list(read(tmp_path / "out.mcap"))) == ITEMS
     seen = [(topic, log_time - ZERO_NS) for topic, log_time, _, _ in others_see(tmp_path / "out.mcap")]
     assert [one for one in seen if one[0] != "/uavctl/recorder"] == [(topic, at_ns) for topic, at_ns, _ in ITEMS]
-    assert {one.zero_utc_ns for one in walk(path) if hasattr(one, "zero_utc_ns")} == {ZERO_NS}
+    assert {one.zero_utc_ns for one in scan_recording(path) if hasattr(one, "zero_utc_ns")} == {ZERO_NS}
 
 
 def test_the_offset_is_taken_between_two_looks_at_our_clock(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,8 @@ from recording_fakes import record_flight, stored_byte
 
 from logs.recording.disk import DiskFile
 from logs.recording.export import TableFormat, export_tables, make_file_stem
-from logs.recording.reader import RecordedMessage, good_messages, read, segment_files
+from logs.recording.file_scan import RecordedMessage
+from logs.recording.reader import find_segments, read, read_messages
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.tlog import export_tlog
@@ -157,7 +158,7 @@ def with_unknown(path: Path) -> None:
     record_flight(path.with_name("known.mcap"), 9)
     segment = Segment(DiskFile(path), 1024)
     number = 0
-    for message in good_messages(path.with_name("known.mcap")):
+    for message in read_messages(path.with_name("known.mcap")):
         number += 1
         segment.add(QueuedMessage(message.definition, number, message.at_ns, message.data))
     for _ in range(2):
@@ -308,8 +309,8 @@ def test_progress_sees_every_message_and_knows_their_number(tmp_path: Path, file
     )
     for entry in view_rig.fly_view().entries:
         recorder.put(*entry)
-    assert recorder.close().ok and len(segment_files(path)) == files
-    whole = sum(1 for _ in good_messages(path))
+    assert recorder.close().ok and len(find_segments(path)) == files
+    whole = sum(1 for _ in read_messages(path))
     seen: list[tuple[str, int | None, int]] = []
 
     def watch(messages: Iterable[RecordedMessage], total: int | None, what: str) -> Iterator[RecordedMessage]:
@@ -323,7 +324,7 @@ def test_progress_sees_every_message_and_knows_their_number(tmp_path: Path, file
     assert seen == [("reading", whole, whole), ("writing", whole, whole)]
     export_tlog(path, tmp_path / "a.tlog", watch=watch)
     assert seen[2:] == [("writing", whole, whole)]
-    last = segment_files(path)[-1]
+    last = find_segments(path)[-1]
     last.write_bytes(last.read_bytes()[:-100])
     export_tlog(path, tmp_path / "b.tlog", watch=watch)
     assert seen[3][:2] == ("writing", None)

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
-from logs.recording.disk import remove_on_error
 from logs.recording.export import TableFormat, Watch, export_tables
-from logs.recording.reader import RecordedMessage, good_messages
+from logs.recording.file_scan import RecordedMessage
+from logs.recording.output_files import remove_on_error
+from logs.recording.reader import read_messages
 from logs.recording.tlog import export_tlog
 from uavctl.errors import RecordingError
 
@@ -94,7 +95,7 @@ def test_after_it_the_same_export_goes_through(flight: Path, tmp_path: Path) -> 
     for one in exported.tables:
         with Path(one.file).open(newline="", encoding="utf-8") as file:
             rows += sum(1 for _ in csv.reader(file)) - 1
-    assert rows == sum(one.rows for one in exported.tables) >= len(list(good_messages(flight))) - 1
+    assert rows == sum(one.rows for one in exported.tables) >= len(list(read_messages(flight))) - 1
 
 
 def test_an_old_file_outlives_a_new_one(tmp_path: Path) -> None:

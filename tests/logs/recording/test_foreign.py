@@ -19,7 +19,7 @@ from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError
-from uavctl.loop import VEHICLE
+from uavctl.mavlink.connection import VEHICLE
 from uavctl.records import Datagram, raw_topic
 
 

@@ -15,7 +15,8 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.recording.foreign import ROS1, ROS2, UnreadableError, make_unwrapper, read_mcap
+from logs.recording.foreign import read_mcap
+from logs.recording.mavros import ROS1, ROS2, UnreadableError, make_unwrapper
 from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.errors import RecordingError
 

@@ -9,10 +9,11 @@ from recording_fakes import HEADER, Clock, record_flight, stored_byte, write_two
 from rich.console import Console
 from view_rig import record
 
-from logs.recording.disk import MAGIC, check_free_space
+from logs.recording.disk import check_free_space
+from logs.recording.file_kind import MAGIC
 from logs.recording.info import RecordingInfo, read_info
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import header, read
+from logs.recording.reader import read, read_header
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from uavctl.cli.app import run
@@ -125,7 +126,7 @@ def test_lost_header_is_not_taken_for_an_early_end(tmp_path: Path) -> None:
     path.write_bytes(data)
     recover(path, tmp_path / "out.mcap")
     with pytest.raises(RecordingError, match="or that chunk was lost"):
-        header(tmp_path / "out.mcap")
+        read_header(tmp_path / "out.mcap")
 
 
 def test_room_is_refused_where_a_recording_is_or_no_folder_can_be(tmp_path: Path) -> None:

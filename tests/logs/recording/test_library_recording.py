@@ -12,7 +12,7 @@ from places import DATA
 from recording_fakes import flight
 
 from logs.recording.info import read_info
-from logs.recording.reader import read, records
+from logs.recording.reader import read, read_kind
 from logs.recording.recorder import SyncRecorder
 from uavctl.cli.app import run
 from uavctl.records import Header, Plan, PolicyLibrary
@@ -33,12 +33,12 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0)
 
 
 def test_it_reads_and_says_which_library_it_carries(old: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (header,), (carried,) = list(records(old, Header)), list(records(old, PolicyLibrary))
+    (header,), (carried,) = list(read_kind(old, Header)), list(read_kind(old, PolicyLibrary))
     assert header.library_id == carried.library_id
     found = document(capsys, "log", "info", str(old))
     assert found["library"] == {"library_id": carried.library_id, "bytes": len(carried.data)}
     assert found["origin"]["library_id"] == carried.library_id
-    assert "mixture" in {plan.method for plan in records(old, Plan)}
+    assert "mixture" in {plan.method for plan in read_kind(old, Plan)}
     both = document(capsys, "log", "compare", str(old), str(old))
     assert not both["parameters"]
 

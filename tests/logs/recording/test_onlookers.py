@@ -9,9 +9,10 @@ from recording_fakes import Clock, Disk, drop_recorder_notes, flight, round_reco
 from view_rig import fly_view, record
 
 from logs.recording.derived_topics import VIEWS
+from logs.recording.file_scan import RecordedMessage, scan_file
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
+from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment
@@ -36,7 +37,7 @@ def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path
     for item in items:
         recorder.put(*item)
     recorder.close()
-    want = [m.data for m in scan(whole) if isinstance(m, RecordedMessage) and is_view(m.definition.topic)]
+    want = [m.data for m in scan_file(whole) if isinstance(m, RecordedMessage) and is_view(m.definition.topic)]
     number = 0
     while True:
         path = tmp_path / f"at{number}" / "flight.mcap"
@@ -55,7 +56,7 @@ def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path
         if disk.operations <= number:
             break
         assert status.ok and drop_recorder_notes(list(read(path))) == round_records(items), number
-        messages = [m for file in segment_files(path) for m in scan(file) if isinstance(m, RecordedMessage)]
+        messages = [m for file in find_segments(path) for m in scan_file(file) if isinstance(m, RecordedMessage)]
         assert [m.data for m in messages if is_view(m.definition.topic)] == want
         number += 1
     assert number > 20
@@ -80,7 +81,7 @@ def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
     status = recorder.close()
     assert (status.ok, status.unseen, status.refused) == (True, 1, 0)
     assert drop_recorder_notes(list(read(tmp_path / "flight.mcap"))) == flight(30)
-    last = [*records(tmp_path / "flight.mcap", RecorderNote)][-1]
+    last = [*read_kind(tmp_path / "flight.mcap", RecorderNote)][-1]
     assert last.text.startswith("end; 1 without views: Header: the header's design cannot be used")
 
 
@@ -112,7 +113,7 @@ def test_who_watches_sees_each_message_once_in_order(tmp_path: Path) -> None:
     for item in fly_view().entries:
         recorder.put(*item)
     recorder.close()
-    written = [(m.definition.topic, m.at_ns, m.data) for m in scan(path) if isinstance(m, RecordedMessage)]
+    written = [(m.definition.topic, m.at_ns, m.data) for m in scan_file(path) if isinstance(m, RecordedMessage)]
     unnoted = [one for one in written if one[0] != "/uavctl/recorder"]
     assert seen == unnoted
 

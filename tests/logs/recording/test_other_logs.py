@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from ulog_writer import UlogWriter, message
 
-from logs.recording.disk import FileKind, detect_kind
+from logs.recording.file_kind import FileKind, detect_kind
 from logs.recording.mavlink_flight import read_flight
 from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
-from logs.recording.disk import refuse_existing_files, write_atomically
+from logs.recording.output_files import refuse_existing_files, write_atomically
 from logs.recording.recover import recover
 from logs.recording.segment import Segment
 from uavctl.cli.flying import LIVE_PORT, choose_live_port

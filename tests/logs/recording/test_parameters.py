@@ -94,7 +94,7 @@ def test_frames_that_are_skipped_tell_what_reading_them_would(monkeypatch: pytes
         chunks = [whole[a:b] for a, b in zip([0, *cuts], [*cuts, len(whole)], strict=True)]
         quick = read(chunks)
         with monkeypatch.context() as patch:
-            patch.setattr("logs.recording.parameters._unread", lambda _: 0)
+            patch.setattr("logs.recording.parameters._find_frame", lambda _: 0)
             assert read(chunks) == quick, chunks
 
 

@@ -16,7 +16,7 @@ from recording_fakes import (
 )
 
 from logs.recording.disk import DiskFile
-from logs.recording.reader import header, read, records, segment_files
+from logs.recording.reader import find_segments, read, read_header, read_kind
 from logs.recording.recorder import SyncRecorder
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.topics import encode, get_definition
@@ -30,9 +30,9 @@ def test_records_of_one_type(tmp_path: Path) -> None:
     items = record_flight(path, 50)
     for kind in (Datagram, Setpoint, Event, Record):
         wanted = [record for _, _, record in items if isinstance(record, kind)]
-        got = [record for record in records(path, kind) if type(record).__name__ != "RecorderNote"]
+        got = [record for record in read_kind(path, kind) if type(record).__name__ != "RecorderNote"]
         assert got == wanted
-    assert header(path) == HEADER
+    assert read_header(path) == HEADER
 
 
 @pytest.mark.parametrize("name", ["missing.mcap", "text.mcap"])
@@ -49,7 +49,7 @@ def test_recording_without_header_says_so(tmp_path: Path) -> None:
     path.touch()
     assert list(read(path)) == []
     with pytest.raises(RecordingError, match="no header"):
-        header(path)
+        read_header(path)
 
 
 @pytest.mark.slow
@@ -72,10 +72,10 @@ def test_cut_anywhere_it_reads_to_the_last_whole_chunk(tmp_path: Path) -> None:
 def test_segments_read_as_one(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     write_two_segments(path)
-    assert [file.name for file in segment_files(path)] == ["flight.mcap", "flight-2.mcap"]
+    assert [file.name for file in find_segments(path)] == ["flight.mcap", "flight-2.mcap"]
     assert drop_recorder_notes(list(read(path))) == flight(100)
     # the second alone has the header too
-    assert header(tmp_path / "flight-2.mcap") == HEADER
+    assert read_header(tmp_path / "flight-2.mcap") == HEADER
 
 
 def test_missing_segment_is_noticed(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_other_recording_with_such_a_name_is_not_taken_in(tmp_path: Path) -> Non
     path = tmp_path / "flight.mcap"
     items = record_flight(path, 10)
     record_flight(tmp_path / "flight-2.mcap", 20)
-    assert segment_files(path) == (path,)
+    assert find_segments(path) == (path,)
     assert drop_recorder_notes(list(read(path))) == items
 
 

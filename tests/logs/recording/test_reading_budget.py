@@ -34,17 +34,18 @@ from logs.recording.budget import (
     read_whole,
 )
 from logs.recording.disk import DiskFile
-from logs.recording.foreign import UnreadableError, make_unwrapper, read_mcap
-from logs.recording.reader import (
+from logs.recording.file_scan import (
     AttachedFile,
     Damage,
     EndOfFile,
     RecordedMessage,
     Scanned,
-    good_messages,
-    last_chunk,
-    scan,
+    read_last_chunk,
+    scan_file,
 )
+from logs.recording.foreign import read_mcap
+from logs.recording.mavros import UnreadableError, make_unwrapper
+from logs.recording.reader import read_messages
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment
@@ -66,7 +67,7 @@ def put(folder: Path, data: bytes, name: str = "flight.mcap") -> Path:
 
 def scan_within_budget(path: Path, unpacked_bytes: int = 0) -> list[Scanned]:
     with limit_checksums(FILE_PASSES * path.stat().st_size + unpacked_bytes):
-        return list(scan(path))
+        return list(scan_file(path))
 
 
 # --- recordings of ours ----------------------------------------------------------------------------------------------
@@ -80,7 +81,7 @@ def test_no_byte_is_looked_at_again_and_again(make: Callable[[int], bytes], size
     *_, end = scan_within_budget(path)
     assert end == EndOfFile(finished=False, complete=False)
     with pytest.raises(RecordingError, match=r"flight.mcap, offset 8: .*log recover"):
-        list(good_messages(path))
+        list(read_messages(path))
 
 
 RECORDS = st.one_of(
@@ -122,7 +123,7 @@ def test_a_recording_unpacks_to_no_more_than_any_flight(tmp_path: Path, monkeypa
 def test_a_chunk_has_no_more_messages_than_bytes_allow(tmp_path: Path) -> None:
     definition = hostile.schema(1, "x", "", "") + hostile.channel(1, 1, "/x", "json")
     path = put(tmp_path, hostile.MAGIC + hostile.chunk(definition + hostile.message(1, b"") * 300_000))
-    items = list(scan(path))
+    items = list(scan_file(path))
     messages = [item for item in items if isinstance(item, RecordedMessage)]
     assert len(messages) <= FREE_RECORDS + path.stat().st_size
     assert any(isinstance(item, Damage) and "brings more records" in item.reason for item in items)
@@ -133,7 +134,7 @@ def test_no_claim_is_believed(tmp_path: Path) -> None:
     for name, data in hostile.make_huge_claims().items():
         path = put(tmp_path, data, f"{name}.mcap")
         with limit_memory(2_000_000):
-            items = list(scan(path))
+            items = list(scan_file(path))
             assert any(isinstance(item, Damage) for item in items), name
             with pytest.raises(RecordingError, match=f"{name}.mcap"):
                 read_mcap(path)
@@ -150,7 +151,7 @@ def test_a_summary_that_was_written_wrong_is_none(tmp_path: Path) -> None:
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, len(head), 0)
         checksum = struct.pack("<I", zlib.crc32(record + footer))
         path = put(tmp_path, head + record + footer + checksum + hostile.MAGIC)
-        assert last_chunk(path) == []
+        assert read_last_chunk(path) == []
 
 
 def test_attachments_are_not_copied_into_memory(tmp_path: Path) -> None:
@@ -159,7 +160,7 @@ def test_attachments_are_not_copied_into_memory(tmp_path: Path) -> None:
         tmp_path, hostile.MAGIC + hostile.record(Opcode.ATTACHMENT, content + struct.pack("<I", zlib.crc32(content)))
     )
     with limit_memory(1_000_000):
-        attached, _ = scan(path)
+        attached, _ = scan_file(path)
     assert attached == AttachedFile("name", "type", 2**23)
 
 
@@ -186,7 +187,7 @@ def test_a_vehicle_that_stands_still_is_read_to_its_end(tmp_path: Path) -> None:
         )
         recorder.put("/uavctl/event", index, event)
     assert recorder.close().ok
-    messages = list(good_messages(path))
+    messages = list(read_messages(path))
     assert sum(len(message.data) for message in messages) > 10 * path.stat().st_size
     assert sum(message.definition.topic == "/uavctl/event" for message in messages) == 20_000
 
@@ -195,9 +196,9 @@ def test_a_whole_recording_is_looked_at_in_proportion(tmp_path: Path) -> None:
     for number in (300, 3000):
         path = tmp_path / f"{number}.mcap"
         record_flight(path, number)
-        unpacked_bytes = sum(len(message.data) + 100 for message in good_messages(path))
+        unpacked_bytes = sum(len(message.data) + 100 for message in read_messages(path))
         with limit_checksums(3 * path.stat().st_size + 2 * unpacked_bytes), limit_calls(60 * number):
-            assert sum(isinstance(item, RecordedMessage) for item in scan(path)) > number
+            assert sum(isinstance(item, RecordedMessage) for item in scan_file(path)) > number
 
 
 # --- recordings of other programs ------------------------------------------------------------------------------------
@@ -283,7 +284,7 @@ def test_definitions_that_pack_well_do_not_fill_the_memory(kind: str, tmp_path: 
     with limit_memory(limit_bytes), pytest.raises(RecordingError, match="a record makes what is read into memory more"):
         read_mcap(path)
     with limit_memory(limit_bytes):
-        assert any(isinstance(item, Damage) and "read into memory" in item.reason for item in scan(path))
+        assert any(isinstance(item, Damage) and "read into memory" in item.reason for item in scan_file(path))
 
 
 # --- definitions of ROS ----------------------------------------------------------------------------------------------

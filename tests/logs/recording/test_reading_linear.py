@@ -12,8 +12,8 @@ from foreign_rig import TLOGS, rows_of, write
 from ulog_writer import UlogWriter
 from work_rig import count_lines
 
+from logs.recording.file_scan import scan_file
 from logs.recording.foreign import read_mcap
-from logs.recording.reader import scan
 from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.config.document import find_excess, find_key_lines, read_text
@@ -71,7 +71,7 @@ READERS: dict[str, tuple[Callable[[Path, int], None], Callable[[Path], object]]]
     "ULog": (make_ulog, read_ulog),
     "MCAP, many frames": (make_frames, read_mcap),
     "MCAP, many topics": (make_topics, read_mcap),
-    "MCAP, chunks": (make_frames, lambda path: list(scan(path))),
+    "MCAP, chunks": (make_frames, lambda path: list(scan_file(path))),
     "TOML": (make_toml, read_toml),
     "CSV": (make_trajectory, read_trajectory),
 }

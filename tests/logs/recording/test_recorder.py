@@ -12,8 +12,9 @@ from view_rig import fly_view
 import logs.recording.recorder as recorder_module
 from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.file_scan import RecordedMessage, scan_file
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
+from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import (
     RECORDS,
     VIEWS,
@@ -103,7 +104,7 @@ def test_refused_records_are_counted_and_told(tmp_path: Path) -> None:
     assert status.refused == 6
     assert "Event" in status.refusal
     assert drop_recorder_notes(list(read(path))) == [("/uavctl/event", 2**64 - 1, EVENT), ("/raw/vehicle/in", 1, raw)]
-    notes = list(records(path, RecorderNote))
+    notes = list(read_kind(path, RecorderNote))
     assert notes[-1].refused == 6
     assert any("records lost" in note.text for note in notes)
 
@@ -211,7 +212,7 @@ def test_views_that_a_rest_overtakes_are_written_after_it(tmp_path: Path) -> Non
     assert journal.status().reason and len(journal.views_due) == len(items)
     journal.finish()
     assert drop_recorder_notes(list(read(path))) == items
-    files = [[one for one in scan(file) if isinstance(one, RecordedMessage)] for file in segment_files(path)]
+    files = [[one for one in scan_file(file) if isinstance(one, RecordedMessage)] for file in find_segments(path)]
     assert [sum(one.definition.topic == LOG for one in file) for file in files] == [0, 10]
 
 
@@ -236,11 +237,11 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
         if 0 < disk.operations < number:
             break
         assert status.ok and drop_recorder_notes(list(read(path))) == round_records(items), number
-        messages = [one for file in segment_files(path) for one in scan(file) if isinstance(one, RecordedMessage)]
+        messages = [one for file in find_segments(path) for one in scan_file(file) if isinstance(one, RecordedMessage)]
         shown = [one.data for one in messages if is_view(one.definition.topic)]
         views = views or shown
         assert shown == views and len(views) > len(items) // 2, number
-        assert len(segment_files(path)) <= 1 + status.failures
+        assert len(find_segments(path)) <= 1 + status.failures
         number += 1
     assert number > 20
 

@@ -9,7 +9,7 @@ from recording_fakes import drop_recorder_notes, flight, record_flight, stored_b
 from logs.recording.disk import DiskFile
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import read, records
+from logs.recording.reader import read, read_kind
 from logs.recording.recover import recover
 from uavctl.errors import RecordingError
 
@@ -55,7 +55,7 @@ def test_one_bad_chunk_costs_only_its_messages(tmp_path: Path, number: int) -> N
         assert result.messages_lost - len(lost) in (0, 1)
     assert result.chunks_bad == 1
     assert not result.lossless
-    assert "lost" in list(records(out, RecorderNote))[-1].text
+    assert "lost" in list(read_kind(out, RecorderNote))[-1].text
     assert read_info(out).damage == ()
 
 

@@ -15,7 +15,7 @@ from logs.recording.tlog import read_tlog, replay_tlog
 from logs.recording.topics import encode, parse_raw_topic
 from uavctl.config import load_config
 from uavctl.errors import RecordingError
-from uavctl.loop import VEHICLE
+from uavctl.mavlink.connection import VEHICLE
 from uavctl.records import Datagram, Decision, Event, Plan, Setpoint, StepInput
 
 

@@ -16,10 +16,11 @@ from mcap.reader import make_reader
 from recording_fakes import HEADER, Clock, Disk, Item, drop_recorder_notes, flight
 
 from logs.recording.derived_topics import LOG
-from logs.recording.disk import MAGIC, DiskFile, FreeSpaceMonitor
+from logs.recording.disk import DiskFile, FreeSpaceMonitor
+from logs.recording.file_kind import MAGIC
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
-from logs.recording.reader import header, read, records, segment_files
+from logs.recording.reader import find_segments, read, read_header, read_kind
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment
@@ -42,7 +43,7 @@ def fly(recorder: SyncRecorder, clock: Clock, items: list[Item]) -> None:
 
 
 def texts(path: Path) -> list[str]:
-    return [note.text for note in records(path, RecorderNote)]
+    return [note.text for note in read_kind(path, RecorderNote)]
 
 
 def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -> None:
@@ -52,7 +53,7 @@ def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -
     recorder = SyncRecorder(path, SMALL, clock=clock)
     fly(recorder, clock, items)
     status = recorder.close()
-    files = segment_files(path)
+    files = find_segments(path)
     assert status.ok and (status.failures, status.reason) == (0, "")
     assert status.segments == tuple(map(str, files)) and len(files) > 4
     assert drop_recorder_notes(list(read(path))) == items
@@ -63,7 +64,7 @@ def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -
             count = sum(1 for _ in reader.iter_messages())
         assert summary is not None and summary.statistics is not None
         assert summary.statistics.message_count == count
-        assert header(file) == HEADER
+        assert read_header(file) == HEADER
         attached = sum(one.length for one in summary.attachment_indexes)
         attached += sum(one.length for one in summary.metadata_indexes)
         # a chunk over its size, and the index
@@ -98,8 +99,8 @@ def test_93_a_name_that_somebody_has_taken_is_passed_over_without_a_loss(tmp_pat
     fly(recorder, clock, items)
     status = recorder.close()
     assert status.ok and status.dropped == 0
-    assert {path.with_name(f"flight-{number}.mcap") for number in (4, 6)} <= set(segment_files(path))
-    assert not set(foreign_files) & set(segment_files(path))
+    assert {path.with_name(f"flight-{number}.mcap") for number in (4, 6)} <= set(find_segments(path))
+    assert not set(foreign_files) & set(find_segments(path))
     assert drop_recorder_notes(list(read(path))) == items
     assert [file.read_bytes() for file in foreign_files] == [data] * 3
 
@@ -113,7 +114,7 @@ def test_93_a_file_that_somebody_adds_to_a_whole_recording_is_no_part_of_it(tmp_
     fly(recorder, clock, items)
     recorder.close()
     path.with_name("flight-2.mcap").touch()
-    assert segment_files(path) == (path,) and drop_recorder_notes(list(read(path))) == items
+    assert find_segments(path) == (path,) and drop_recorder_notes(list(read(path))) == items
 
 
 def test_each_file_is_on_the_disk_before_the_next_is_begun(tmp_path: Path) -> None:
@@ -170,7 +171,7 @@ def test_what_every_file_repeats_does_not_count_to_its_size(tmp_path: Path) -> N
         recorder.put(*item)
     recorder.close()
     assert drop_recorder_notes(list(read(path))) == items
-    assert 2 <= len(segment_files(path)) < len(items) // 5
+    assert 2 <= len(find_segments(path)) < len(items) // 5
 
 
 @pytest.mark.slow
@@ -317,7 +318,7 @@ def test_32_a_flipped_byte_in_a_later_file_is_refused_or_restored(tmp_path: Path
     for item in items:
         recorder.put(*item)
     recorder.close()
-    files = segment_files(path)
+    files = find_segments(path)
     assert len(files) > 2
     for file in (files[1], files[-1]):  # each with the header again, an index and a footer
         data = file.read_bytes()

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from loopback_rig import lockstep
 
-from logs.recording.disk import MAGIC, refuse_recording_path
-from logs.recording.reader import lacks_end
+from logs.recording.file_kind import MAGIC
+from logs.recording.output_files import refuse_recording_path
+from logs.recording.reader import explain_missing_end
 from logs.recording.recorder import SyncRecorder
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError, UsageError
@@ -56,10 +57,10 @@ def test_a_recording_of_any_name_is_known_by_its_first_bytes(tmp_path: Path) -> 
 
 def test_a_file_is_finished_with_its_whole_index_only(recorded: Path, tmp_path: Path) -> None:
     data = recorded.read_bytes()
-    assert not lacks_end(recorded)
+    assert not explain_missing_end(recorded)
     cut = tmp_path / "cut.mcap"
     for size in (0, 5, len(data) // 2, len(data) - 30, len(data) - 1):
         cut.write_bytes(data[:size])
-        assert lacks_end(cut), size
+        assert explain_missing_end(cut), size
     with pytest.raises(RecordingError, match="no such recording"):
-        lacks_end(tmp_path / "missing.mcap")
+        explain_missing_end(tmp_path / "missing.mcap")

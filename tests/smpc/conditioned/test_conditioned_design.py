@@ -12,7 +12,7 @@ from loopback_rig import lockstep
 from msgspec.structs import replace
 
 from logs.recording.design_view import read_design
-from logs.recording.reader import header, read
+from logs.recording.reader import read, read_header
 from logs.recording.recorder import SyncRecorder
 from uavctl.build.controller import build_conditioned, build_flight_design, compute_reference_limits, make_design_record
 from uavctl.cli.app import run as main
@@ -58,7 +58,7 @@ def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys
     assert main(["loopback", "--config", config, "--duration", "5", "--out", str(tmp_path), "--json"]) == 0
     flown = json.loads(capsys.readouterr().out)
     assert flown["steps"] > 80
-    reported = header(Path(flight))
+    reported = read_header(Path(flight))
     assert reported.design_id == figures["design_id"] == reported.design["design_id"]
     assert {
         key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")

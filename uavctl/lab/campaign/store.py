@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from logs.recording.replay import unequal
+from logs.recording.replay import iterate_different_leaves
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import DOCUMENT, RUNS, read_document
@@ -214,7 +214,7 @@ def make_table(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
 
 def find_first_difference(stored: object, current: object) -> str | None:
     """Return the first place in which two JSON documents differ, in words."""
-    difference = next(unequal(stored, current), None)
+    difference = next(iterate_different_leaves(stored, current), None)
     return (
         None
         if difference is None

@@ -22,8 +22,8 @@ from logs.recording.tlog import TlogPacket
 from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.errors import RecordingError
-from uavctl.loop import MOCAP, make_links
 from uavctl.mavlink.clocksync import ClockSource
+from uavctl.mavlink.connection import MOCAP, make_links
 from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.profile import PROFILES, find_autopilot_name
 from uavctl.records import Datagram, PositionSample, Record, Setpoint, StepInput

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.recording.budget import read_whole
-from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
+from logs.recording.output_files import write_atomically
 from logs.recording.summary import compute_position_errors_m
 from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
 from logs.report.plots import DASHED, DOTTED

@@ -33,8 +33,8 @@ from uavctl.errors import RecordingError
 from uavctl.flight.controller import Controller
 from uavctl.lab.figure_eight import to_vec3
 from uavctl.lab.whatif.rewrite import InertialFrames, PositionFrame, SourceFrames
-from uavctl.loop import MOCAP, VEHICLE, ControlLoop
-from uavctl.mavlink.connection import STREAM_SCHEMES
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.connection import MOCAP, STREAM_SCHEMES, VEHICLE
 from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
 from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, discard
@@ -291,7 +291,7 @@ def refly(
         elif isinstance(record, Datagram) and not record.outgoing:
             flight.handle_datagram(record)
         elif isinstance(record, Refused):
-            loop.refused(record.link, record.counts, record.at_ns)
+            loop.add_refusals(record.link, record.counts, record.at_ns)
         elif isinstance(record, Truth):
             flight.truths.append(record)
         if flight.is_over:
@@ -351,10 +351,10 @@ class _ReflownLoop:
         for command in record.commands:
             self._loop.order(command)
         if self._loop.outside == self._history.config.smpc.controller:
-            self._loop.answered(record.answered_ns)
+            self._loop.note_solve_time(record.answered_ns)
         self._tap.setpoint = None
         ticked = self._loop.tick(record.tick, at_ns, discard, record.missed_ticks, record.stop)
-        self._loop.timing(ticked, lateness_ns=0, send_ns=0)
+        self._loop.record_timing(ticked, lateness_ns=0, send_ns=0)
         self._steer_deviation(at_ns, ticked.decision.reason)
         self.record_truth(at_ns)
 

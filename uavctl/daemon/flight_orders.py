@@ -1,4 +1,4 @@
-"""Orders of the command line: take-off, a position to go to, and the time limit of the end."""
+"""Orders with which a flight begins: take-off, a position to go to; and the time limit of its end."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def make_goto_keys(place_m: Sequence[float]) -> dict[str, object]:
     }
 
 
-class Engagement:
-    """Order of the command line (take-off, position to go to), and its progress.
+class FlightOrders:
+    """Orders with which a flight begins (take-off, position to go to), and their progress.
 
     Attributes:
         goal: the position of `--goto`, local NED [m].
@@ -69,7 +69,7 @@ class Engagement:
         return self._take_off_m is not None
 
     def begin(self, loop: ControlLoop) -> None:
-        """Note the order in the course of the flight, before the first tick."""
+        """Note the orders in the account of the flight, before the first tick."""
         loop.account.takes_off = self.takes_off
         loop.account.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
 
