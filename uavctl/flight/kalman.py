@@ -103,13 +103,20 @@ class Belief(msgspec.Struct, frozen=True, eq=False):
     inertial: InertialTrust = UNUSED  # whether inertial data are used
 
 
+def make_model(plant: Plant, parameters: EstimatorParameters) -> Plant:
+    """Make the plant that the filter estimates: x, and behind it the biases d and what inertial data are off, b."""
+    uses_inertial = parameters.inertial_std_mps2 > 0.0
+    model = add_bias(plant, parameters.bias_drift, force=uses_inertial) if parameters.bias_drift else plant
+    if not uses_inertial:
+        return model
+    return add_gauss_markov(model, np.full(len(plant.axes), parameters.inertial_bias_mps2), parameters.inertial_bias_s)
+
+
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
     """Make the filter of a plant, with `dt_ns` the integer Δt of the grid [ns]."""
-    n_bias, uses_inertial = plant.n_u if parameters.bias_drift else 0, parameters.inertial_std_mps2 > 0.0
-    model = add_bias(plant, parameters.bias_drift, force=uses_inertial) if n_bias else plant
-    n_inertial = len(plant.axes) if uses_inertial else 0
-    if n_inertial:
-        model = add_gauss_markov(model, np.full(n_inertial, parameters.inertial_bias_mps2), parameters.inertial_bias_s)
+    model = make_model(plant, parameters)
+    n_bias = plant.n_u if parameters.bias_drift else 0
+    n_inertial = len(plant.axes) if parameters.inertial_std_mps2 else 0
     inertial_z, inertial_u = _make_inertial_model(plant, model, n_inertial)
     push = np.zeros((model.n_x + model.n_w, n_bias))
     if n_bias and n_inertial:

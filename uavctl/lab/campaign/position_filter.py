@@ -59,19 +59,29 @@ class PositionFilter:
         """
         self._positions[step] = positions
         if step:
-            self._before[step] = self._predict(*self._after, inputs[:, step - 1])
+            self._before[step] = self._advance(*self._after, inputs[:, step - 1], step - 1)
         (arrived,) = np.nonzero((self._known_steps[:, : step + 1] == step).any(axis=0))
         for capture in range(int(arrived[0]) if arrived.size else step, step + 1):
             mean, cov = self._after = self._correct(capture, step)
             is_newest = newest_captures == capture
             self._mean[is_newest], self._cov[is_newest] = mean[is_newest], cov[is_newest]
             if capture < step:
-                self._before[capture + 1] = self._predict(mean, cov, inputs[:, capture])
+                self._before[capture + 1] = self._advance(mean, cov, inputs[:, capture], capture)
         for capture in [other for other in self._before if other < step - self._max_delay_steps]:
             del self._before[capture], self._positions[capture]
         return self._mean.copy(), self._cov.copy()
 
-    def _predict(self, mean: Array, cov: Array, u: Array) -> tuple[Array, Array]:
+    @property
+    def now(self) -> tuple[Array, Array]:
+        """States (N, n_x) and covariances of the newest step, from all positions that are known."""
+        return self._after
+
+    def _advance(self, mean: Array, cov: Array, u: Array, step: int) -> tuple[Array, Array]:
+        """Advance beliefs over a step, with what is measured within it besides positions: here nothing."""
+        del step
+        return self.predict(mean, cov, u)
+
+    def predict(self, mean: Array, cov: Array, u: Array) -> tuple[Array, Array]:
         """Predict states and covariances one step ahead, under the inputs (N, n_u)."""
         plant = self._plant
         return mean @ plant.a.T + u @ plant.b.T, plant.a @ cov @ plant.a.T + self._noise
