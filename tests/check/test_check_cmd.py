@@ -31,6 +31,7 @@ from uavctl.records import Checked, Event
 OF_TIME = frozenset(
     {"vehicle", "position rate", "position age", "longest gap", "position loss", "vehicle clock", "source clock"}
 )
+NO_REHEARSALS = ("--set", "check.rehearsals=0")  # they take seconds, and are tested by themselves
 
 
 def accept(*names: str) -> list[str]:
@@ -64,7 +65,7 @@ def urls() -> Iterator[list[str]]:
 
 
 def checked(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    code = run(["check", "--json", "--seconds", "4", "--set", "check.wait_s=5", *arguments])
+    code = run(["check", "--json", "--seconds", "4", "--set", "check.wait_s=5", *NO_REHEARSALS, *arguments])
     out = capsys.readouterr().out
     assert out.count("\n") == 1
     document: dict[str, Any] = json.loads(out)
@@ -95,7 +96,7 @@ def test_a_wrong_frame_is_not(capsys: pytest.CaptureFixture[str], urls: list[str
 def test_people_get_problems_first_and_a_line_for_what_is_good(
     capsys: pytest.CaptureFixture[str], urls: list[str]
 ) -> None:
-    assert run(["check", "--seconds", "4", *urls, "--set", "frame.yaw_deg=90"]) == 1
+    assert run(["check", "--seconds", "4", *urls, *NO_REHEARSALS, "--set", "frame.yaw_deg=90"]) == 1
     blocks = capsys.readouterr().out.split("\n\n")
     assert blocks[0].startswith("check: not ready (")
     states = [block.split()[0] for block in blocks[1:]]
@@ -110,7 +111,7 @@ def test_people_get_problems_first_and_a_line_for_what_is_good(
 @pytest.mark.fault(15)
 def test_fly_does_not_arm_with_a_wrong_frame(urls: list[str], tmp_path: Path) -> None:
     out = tmp_path / "flight"
-    options = ["--arm", "--takeoff", "1", "--set", "frame.convention=enu", "--set", "check.seconds=4"]
+    options = ["--arm", "--takeoff", "1", "--set", "frame.convention=enu", "--set", "check.seconds=4", *NO_REHEARSALS]
     command = [sys.executable, "-m", "uavctl", "fly", *urls, "--out", str(out), *options]
     done = subprocess.run(command, capture_output=True, text=True, timeout=3 * LIMIT_S, check=False)
     assert done.returncode == 1

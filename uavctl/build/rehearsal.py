@@ -145,7 +145,7 @@ def _fly_mission(
     """Fly the mission on a vehicle; return the result without tracking figures, and positions (steps, axes) [m]."""
     mission, plant, dt_ns = controller.mission, design.plant, controller.dt_ns
     motion, index = mission.trajectory, list(plant.position_index)
-    x = _make_rehearsal_start(config, design, mission)
+    x = make_rehearsal_start(config, design, mission)
     late_steps = _sample_late_steps(config, design)
     steps = min(MAX_STEPS, round(config.duration_s / plant.dt_s) if motion is None else len(motion.states))
     last_input, state = np.zeros(plant.n_u), None
@@ -214,7 +214,7 @@ def _compute_distances(config: Config, design: ConditionedDesign, positions_m: A
     return distances_m
 
 
-def _make_rehearsal_start(config: Config, design: ConditionedDesign, mission: Mission) -> Array:
+def make_rehearsal_start(config: Config, design: ConditionedDesign, mission: Mission) -> Array:
     """Return the first state (n_x,), at rest where a plan may rest."""
     if mission.trajectory is not None:
         return np.array(mission.trajectory.states[0])

@@ -35,6 +35,7 @@ from uavctl.cli.common import (
     make_key_overrides,
     print_message,
 )
+from uavctl.cli.flight_risk import RiskSeed, compute_flight_risk
 from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
@@ -43,8 +44,9 @@ from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
 from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
+from uavctl.lab.flight_risk import FlightRisk
 from uavctl.mavlink.connection import make_links
-from uavctl.records import Checked, Datagram, Sink
+from uavctl.records import FLIGHT_ITEM, Checked, Datagram, Sink
 from uavctl.smpc.conditioned.planner import ConditionedDesign
 
 MOVE_LIMIT_S = 120.0  # for the guided movements, beside the listening
@@ -198,6 +200,7 @@ def check(
     move: Annotated[
         bool, Parameter(negative=(), help="ask for movements of the body by hand, which show every axis")
     ] = False,
+    seed: RiskSeed = 0,
     out: Annotated[Path, Parameter(help="folder that recordings will be written to")] = Path("flights"),
 ) -> int:
     """Look at rates, ages, frames, clocks, the vehicle's parameters and the disk; arms nothing.
@@ -209,7 +212,7 @@ def check(
     config = loaded.config
     with locate_design_errors(loaded):
         check_axes(config)
-        items = [*make_mission_items(config), *make_disk_items(out, config.log.free_bytes)]
+        items = [*make_mission_items(config, seed=seed), *make_disk_items(out, config.log.free_bytes)]
     items.append(_make_stranger_item(find_security_warnings(config.security, config.daemon)))
 
     def prompt(text: str) -> None:
@@ -230,11 +233,14 @@ def check(
     return 0 if report.ok else 1
 
 
-def make_mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Item, ...]:
-    """Rehearse the mission on the model; no items for the paper's scheme and for a controller of another package.
+def make_mission_items(config: Config, prepared: Prepared | None = None, seed: int = 0) -> tuple[Item, ...]:
+    """Rehearse the mission on the model, and whole flights with all that is random.
+
+    There are no items for the paper's scheme and for a controller of another package.
 
     Args:
         prepared: The controller, if it is made already.
+        seed: Seed of the rehearsed flights.
 
     Raises:
         DesignError: The configuration has no controller.
@@ -249,7 +255,20 @@ def make_mission_items(config: Config, prepared: Prepared | None = None) -> tupl
     state = ItemState.BAD if is_bad else ItemState.NOTE if is_noted else ItemState.GOOD
     value = ". ".join(result.sentences) or f"{result.seconds:g} s rehearsed, {result.relaxed:.0%} of the plans relax"
     want = "plans keep their constraints, and the trajectory to mission.accept_m"
-    return (make_item("mission", state, value, want, result.hint),)
+    mission_item = make_item("mission", state, value, want, result.hint)
+    risk = compute_flight_risk(config, design, controller, seed)
+    return (mission_item,) if risk is None else (mission_item, _make_flight_item(risk))
+
+
+def _make_flight_item(risk: FlightRisk) -> Item:
+    """Make the item of the risk of a flight. It forbids nothing: at a wall, a few steps outside are as planned."""
+    return make_item(
+        FLIGHT_ITEM,
+        ItemState.NOTE if risk.left else ItemState.GOOD,
+        risk.sentence,
+        "no rehearsed flight leaves the room",
+        "fly further from the limits, raise smpc.delta_x, or improve the link",
+    )
 
 
 def make_disk_items(folder: Path, free_bytes: int) -> list[Item]:

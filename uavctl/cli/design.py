@@ -34,9 +34,11 @@ from uavctl.cli.common import (
     make_message_console,
     make_table,
 )
+from uavctl.cli.flight_risk import RiskSeed, compute_flight_risk
 from uavctl.config import Config
 from uavctl.constraint_names import describe_all_relaxed
 from uavctl.errors import UsageError
+from uavctl.lab.flight_risk import FlightRisk
 from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
@@ -107,6 +109,7 @@ def design(
         bool,
         Parameter(negative=(), show_default=False, help="find the terminal gain of least stationary cost, and compare"),
     ] = False,
+    seed: RiskSeed = 0,
     common: Common = DEFAULTS,
 ) -> int:
     """Make a design: schedule, terminal ingredients, Assumption 4 with figures."""
@@ -118,13 +121,15 @@ def design(
         with locate_design_errors(loaded):
             conditioned = build_conditioned(loaded.config)
             rehearsal = rehearse_mission(loaded.config, conditioned)
+            risk = compute_flight_risk(loaded.config, conditioned, seed=seed)
         figures = {
             **make_conditioned_record(conditioned),
             "rehearsal": msgspec.to_builtins(rehearsal),
+            "flight_risk": msgspec.to_builtins(risk),
             "wall_s": time.perf_counter() - begin_s,
         }
         common.show(
-            "design/conditioned", figures, lambda: render_conditioned(conditioned, loaded.config.name, rehearsal)
+            "design/conditioned", figures, lambda: render_conditioned(conditioned, loaded.config.name, rehearsal, risk)
         )
         return 1 if rehearsal is not None and (rehearsal.relaxes or rehearsal.leaves_trajectory) else 0
     with locate_design_errors(loaded):
@@ -146,9 +151,12 @@ def rehearse_mission(config: Config, design: ConditionedDesign) -> RehearsalResu
 
 
 def render_conditioned(
-    design: ConditionedDesign, name: str, rehearsal: RehearsalResult | None = None
+    design: ConditionedDesign,
+    name: str,
+    rehearsal: RehearsalResult | None = None,
+    risk_of_flight: FlightRisk | None = None,
 ) -> RenderableType:
-    """Return tables of the risk of each age and of the limits at rest, and warnings on the mission."""
+    """Return tables of the risk of each age and of the limits at rest, the risk of a flight, and warnings on it."""
     title = f"Risk by the age of information, design {design.design_id} of {name}"
     ages = make_table(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
     risk, transit, problem = design.solver.risk, design.solver.transit_risk, design.solver.problem
@@ -174,7 +182,9 @@ def render_conditioned(
     headings = ("limit", "at", "rests up to", "unit")
     sentences = [] if rehearsal is None or not rehearsal.sentences else [*rehearsal.sentences, rehearsal.hint]
     warnings = [Text(f"{sentence[:1].upper()}{sentence[1:]}.", style="bold yellow") for sentence in sentences]
-    return Group(ages, make_table("Where a plan may rest", headings, rows, ("limit", "unit")), *warnings)
+    rest = make_table("Where a plan may rest", headings, rows, ("limit", "unit"))
+    promises = [] if risk_of_flight is None else [Text(f"A flight {risk_of_flight.sentence}.")]
+    return Group(ages, rest, *promises, *warnings)
 
 
 def make_design_document(design: Design, wall_s: float) -> dict[str, object]:

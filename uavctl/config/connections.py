@@ -345,6 +345,9 @@ def check_signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[Co
         )
 
 
+MAX_REHEARSALS = 1000  # minutes, and some 400 MB for draws and states of two minutes each
+
+
 class CheckConfig(Section, frozen=True, kw_only=True):
     """`uavctl check`, and what it has to say before `uavctl fly --arm` arms (docs/check.md)."""
 
@@ -381,6 +384,15 @@ class CheckConfig(Section, frozen=True, kw_only=True):
         float,
         Meta(ge=0, le=1000, description="how far outside the limits of `sets` a vehicle may stand before a flight [m]"),
     ] = 0.25
+    rehearsals: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=MAX_REHEARSALS,
+            description="flights that are rehearsed with disturbances and losses, for the probability that one leaves "
+            "the room; 0 rehearses none",
+        ),
+    ] = 60
     battery_v: Annotated[
         float, Meta(ge=0, le=1000, description="least voltage of the battery; 0 does not judge it [V]")
     ] = 0.0
