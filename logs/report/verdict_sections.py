@@ -22,6 +22,7 @@ def make_verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
     is_judged = bool(risk.limits[0].measured.trials) and risk.limits[0].promised is not None
     link = verdicts.link
     return [
+        ("Leaves the room", verdicts.room.text),
         ("Promised risk", _describe_verdict(risk.refuted, is_judged)),
         ("Promised link", _describe_verdict(link.refuted, bool(link.news.trials) and link.promised_news is not None)),
         ("Model of the vehicle", _describe_model_verdict(verdicts.model)),

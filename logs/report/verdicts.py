@@ -13,6 +13,7 @@ from logs.report.verdict_clocks import ClockVerdict, StampVerdict, judge_clocks,
 from logs.report.verdict_link import LinkVerdict, judge_link
 from logs.report.verdict_model import ModelVerdict, judge_innovations
 from logs.report.verdict_risk import RiskVerdict, judge_risk
+from logs.report.verdict_room import RoomVerdict, judge_room
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
 from uavctl.errors import ConfigError
@@ -23,6 +24,7 @@ class Verdicts(msgspec.Struct, frozen=True, kw_only=True):
 
     level: float  # of the intervals and bounds of each verdict, all of them together
     risk: RiskVerdict
+    room: RoomVerdict
     link: LinkVerdict
     model: ModelVerdict | None  # None where the configuration of the flight cannot be read any more
     clocks: tuple[ClockVerdict, ...]  # one a connection that tells of its clock
@@ -45,6 +47,7 @@ def judge_flight(flight: FlightData) -> Judgement:
     verdicts = Verdicts(
         level=LEVEL,
         risk=judge_risk(flight, config),
+        room=judge_room(flight),
         link=judge_link(flight, config),
         model=model,
         clocks=judge_clocks(flight),

@@ -17,9 +17,22 @@ from logs.report.statistics import estimate_share
 from logs.report.verdict_clocks import compute_offset_residuals, judge_clocks, judge_stamps
 from logs.report.verdict_link import judge_link
 from logs.report.verdict_risk import judge_risk
+from logs.report.verdict_room import judge_room
 from logs.report.verdicts import Verdicts, judge_flight, read_flown_config
 from uavctl.config import Config
-from uavctl.records import Decision, Event, LinkStats, Plan, PositionSample, Record, Severity, StepInput, Truth
+from uavctl.records import (
+    FLIGHT_ITEM,
+    Checked,
+    Decision,
+    Event,
+    LinkStats,
+    Plan,
+    PositionSample,
+    Record,
+    Severity,
+    StepInput,
+    Truth,
+)
 
 
 def flight(duration_s: float = 40.0, **changes: object) -> FlightData:
@@ -59,6 +72,32 @@ def test_violations_at_steps_with_news_are_trials() -> None:
     assert f"{states.measured.hits} of {states.measured.trials} steps" in verdict.text
     assert "nothing speaks against" in verdict.text and "not prove it" in verdict.text
     assert verdict.source == "truth"
+
+
+def test_steps_beyond_the_room_are_counted_beside_what_was_promised() -> None:
+    found = flight()
+    inside = judge_room(found)
+    upper_m = found.design.state_box.upper[found.design.position_index[0]]
+    assert (inside.promised, inside.outside, inside.source) == (None, 0, "truth")
+    assert inside.beyond_m is not None and inside.beyond_m < 0.0
+    promise = Checked(at_ns=0, name=FLIGHT_ITEM, state="good", value="in 0 of 60", want="none", hint="")
+    other = msgspec.structs.replace(promise, name="mission", value="another")
+    left = judge_room(dataclasses.replace(moved(found, {7, 8, 30}), checks=(other, promise)))
+    assert (left.promised, left.outside, left.steps) == ("in 0 of 60", 3, inside.steps)
+    assert left.beyond_m == pytest.approx(50.0 - upper_m)
+
+
+def test_a_prediction_without_a_position_in_reach_is_no_step_in_the_room() -> None:
+    found = flight()
+    states = [list(one.mean) for one in found.estimates]
+    far = tuple(
+        msgspec.structs.replace(one, mean=(50.0, *one.mean[1:])) if i < 20 else one
+        for i, one in enumerate(found.estimates)
+    )
+    assert states and (seen := judge_room(dataclasses.replace(found, truths=(), estimates=far))).outside > 0
+    old = tuple(msgspec.structs.replace(one, age_steps=found.design.horizon + 1) for one in found.decisions)
+    unseen = judge_room(dataclasses.replace(found, truths=(), estimates=far, decisions=old))
+    assert (seen.source, unseen.steps, unseen.outside, unseen.beyond_m) == ("estimate", 0, 0, None)
 
 
 def test_too_many_violations_refute_the_promise() -> None:
