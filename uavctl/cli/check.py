@@ -41,10 +41,10 @@ from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.config.connections import CheckConfig, find_security_warnings
 from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
+from uavctl.flight.controller import Controller
 from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
-from uavctl.lab.flight_risk import FlightRisk
 from uavctl.mavlink.connection import make_links
 from uavctl.records import FLIGHT_ITEM, Checked, Datagram, Sink
 from uavctl.smpc.conditioned.planner import ConditionedDesign
@@ -212,7 +212,7 @@ def check(
     config = loaded.config
     with locate_design_errors(loaded):
         check_axes(config)
-        items = [*make_mission_items(config, seed=seed), *make_disk_items(out, config.log.free_bytes)]
+        items = [*make_mission_items(config), *make_disk_items(out, config.log.free_bytes)]
     items.append(_make_stranger_item(find_security_warnings(config.security, config.daemon)))
 
     def prompt(text: str) -> None:
@@ -228,15 +228,38 @@ def check(
         items.append(
             make_item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS)
         )
+    # Last, as it takes seconds: a wrong URL is told at once.
+    with locate_design_errors(loaded):
+        items += make_flight_items(config, seed=seed)
     report = CheckReport(ok=not find_refusals(items, config.check), items=tuple(items))
     common.show("check", report, lambda: CheckView(report, config.check))
     return 0 if report.ok else 1
 
 
-def make_mission_items(config: Config, prepared: Prepared | None = None, seed: int = 0) -> tuple[Item, ...]:
-    """Rehearse the mission on the model, and whole flights with all that is random.
+def make_mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Item, ...]:
+    """Rehearse the mission on the model; no items for the paper's scheme and for a controller of another package.
 
-    There are no items for the paper's scheme and for a controller of another package.
+    Args:
+        prepared: The controller, if it is made already.
+
+    Raises:
+        DesignError: The configuration has no controller.
+    """
+    if not config.is_age_conditioned or config.smpc.controller:
+        return ()
+    design, controller = _get_rehearsed(config, prepared)
+    result = rehearse(config, design, controller)
+    is_bad, is_noted = result.relaxes or result.leaves_trajectory, result.saturates or result.depends_on_drag
+    state = ItemState.BAD if is_bad else ItemState.NOTE if is_noted else ItemState.GOOD
+    value = ". ".join(result.sentences) or f"{result.seconds:g} s rehearsed, {result.relaxed:.0%} of the plans relax"
+    want = "plans keep their constraints, and the trajectory to mission.accept_m"
+    return (make_item("mission", state, value, want, result.hint),)
+
+
+def make_flight_items(config: Config, prepared: Prepared | None = None, seed: int = 0) -> tuple[Item, ...]:
+    """Rehearse whole flights with all that is random; no items where `make_mission_items` has none, or without walls.
+
+    The item forbids nothing: at a wall, a few steps outside are as planned.
 
     Args:
         prepared: The controller, if it is made already.
@@ -247,28 +270,24 @@ def make_mission_items(config: Config, prepared: Prepared | None = None, seed: i
     """
     if not config.is_age_conditioned or config.smpc.controller:
         return ()
-    design = build_flight_design(config) if prepared is None else prepared.design
-    controller = build_controller(config, design) if prepared is None else prepared.controller
-    assert isinstance(design, ConditionedDesign)
-    result = rehearse(config, design, controller)
-    is_bad, is_noted = result.relaxes or result.leaves_trajectory, result.saturates or result.depends_on_drag
-    state = ItemState.BAD if is_bad else ItemState.NOTE if is_noted else ItemState.GOOD
-    value = ". ".join(result.sentences) or f"{result.seconds:g} s rehearsed, {result.relaxed:.0%} of the plans relax"
-    want = "plans keep their constraints, and the trajectory to mission.accept_m"
-    mission_item = make_item("mission", state, value, want, result.hint)
-    risk = compute_flight_risk(config, design, controller, seed)
-    return (mission_item,) if risk is None else (mission_item, _make_flight_item(risk))
-
-
-def _make_flight_item(risk: FlightRisk) -> Item:
-    """Make the item of the risk of a flight. It forbids nothing: at a wall, a few steps outside are as planned."""
-    return make_item(
+    risk = compute_flight_risk(config, *_get_rehearsed(config, prepared), seed)
+    if risk is None:
+        return ()
+    item = make_item(
         FLIGHT_ITEM,
         ItemState.NOTE if risk.left else ItemState.GOOD,
         risk.sentence,
         "no rehearsed flight leaves the room",
         "fly further from the limits, raise smpc.delta_x, or improve the link",
     )
+    return (item,)
+
+
+def _get_rehearsed(config: Config, prepared: Prepared | None) -> tuple[ConditionedDesign, Controller]:
+    """Return design and controller, made if they are not yet."""
+    design = build_flight_design(config) if prepared is None else prepared.design
+    assert isinstance(design, ConditionedDesign)
+    return design, build_controller(config, design) if prepared is None else prepared.controller
 
 
 def make_disk_items(folder: Path, free_bytes: int) -> list[Item]:
