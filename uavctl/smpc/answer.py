@@ -20,6 +20,10 @@ INPUT_TOLERANCE = 1e-6
 KEPT_TOLERANCE = 1e-6
 
 
+class QuestionError(ValueError):
+    """A question that cannot be answered: its age or its covariance cannot be."""
+
+
 class Path(msgspec.Struct, frozen=True, eq=False):
     """A trajectory to follow, as deviations from the target."""
 
@@ -163,8 +167,11 @@ class Solver(Protocol):
     """Interface of a solver of the decision problem."""
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
-        """Plan from state `x` (n_x,) to the equilibrium `target` (n_x,); never raises on numbers.
+        """Plan from state `x` (n_x,) to the equilibrium `target` (n_x,); numbers that are not finite get no plan.
 
         With an `preview.age` of j, `x` is the prediction for now from a position j steps old.
+
+        Raises:
+            QuestionError: The question cannot be answered.
         """
         ...
