@@ -41,6 +41,7 @@ from uavctl.flight.state import ControlState, find_mode
 from uavctl.flight.supervise import LOST_NS, Supervised, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
+from uavctl.smpc.plant import Plant
 
 MISSION_OVER = "the mission is over: landing"
 # Behind a position that is older, and without a velocity of the vehicle's own beside them, inertial data make no plans:
@@ -286,7 +287,14 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
         inputs=_shift_inputs(base.bias, controller),
+        sent_mps2=_select_axes(phase.state.plan.sent_mps2, controller.plant),
+        braking=controller.braking if controller.outside else None,
     )
+
+
+def _select_axes(vector: Vec3, plant: Plant) -> Array:
+    """Return the entries (n_axes,) of a vector that the plant has."""
+    return np.array([vector[AXES.index(axis)] for axis in plant.axes])
 
 
 def _shift_inputs(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.records import GaveWay, SolveStatus
+from uavctl.smpc.braking import Braking
 
 # Largest violation of a hard limit by a mean input that is clipped [input units]; with more it is no optimum.
 INPUT_TOLERANCE = 1e-6
@@ -47,6 +48,9 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
     # Smallest and largest inputs (n_u,), biases included, where the vehicle can do less than the design assumes;
     # None: it can do all of that
     inputs: tuple[Array, Array] | None = None
+
+    sent_mps2: Array | None = None  # acceleration setpoint that acts until then (n_axes,), without biases
+    braking: Braking | None = None  # braking of the fallback, for a controller that nothing keeps from the limits
 
     @property
     def nominal(self) -> bool:
