@@ -16,7 +16,6 @@ from uavctl.flight.fallback import (
     begin_fallback,
     compute_brake_accel,
     compute_return_accel,
-    compute_stop_m,
     request_fallback,
     restart_hold,
 )
@@ -295,12 +294,3 @@ def test_a_bias_counts_as_far_as_it_has_been_there_all_the_time_of_late() -> Non
     for after_ns, first_ns in ((3 * S - 1, 5 * S), (3 * S, 5 * S), (3 * S + 1, 6 * S)):
         later = remember_bias(((5 * S, (0.1,)), (6 * S, (0.2,))), 5 * S + after_ns, (0.3,))
         assert (later[0][0], later[-1]) == (first_ns, (5 * S + after_ns, (0.3,)))
-
-
-@pytest.mark.parametrize("speed_mps", [0.1, 1.0, 4.0])
-def test_the_distance_of_braking_is_that_of_its_law(speed_mps: float) -> None:
-    most, way, speed, step_s = 2.5, 0.0, speed_mps, 1e-4
-    for _ in range(200_000):
-        way += speed * step_s
-        speed -= min(PARAMETERS.brake_gain_1ps * speed, most) * step_s
-    assert compute_stop_m(speed_mps, most, PARAMETERS) == pytest.approx(way, rel=1e-3)

@@ -41,6 +41,7 @@ from uavctl.flight.state import ControlState, find_mode
 from uavctl.flight.supervise import Supervised, are_inertial_lost, are_positions_lost, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
+from uavctl.smpc.plant import Plant
 
 MISSION_OVER = "the mission is over: landing"
 # Positions that come back after a silence correct the vehicle's own velocity in their first second. Then they are
@@ -290,7 +291,14 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
         input_bounds=_shift_input_bounds(base.bias, controller),
+        sent_mps2=_select_axes(phase.state.plan.sent_mps2, controller.plant),
+        braking=controller.braking if controller.outside else None,
     )
+
+
+def _select_axes(vector: Vec3, plant: Plant) -> Array:
+    """Return the entries (n_axes,) of a vector that the plant has."""
+    return np.array([vector[AXES.index(axis)] for axis in plant.axes])
 
 
 def _shift_input_bounds(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:

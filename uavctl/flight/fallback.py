@@ -168,15 +168,6 @@ def compute_brake_accel(fallback: Fallback, at_ns: int, velocity_mps: Vec3, para
     return north, east, down
 
 
-def compute_stop_m(speed_mps: float, most_mps2: float, parameters: FallbackParameters) -> float:
-    """Compute the distance that braking takes [m], with so much acceleration at most, and no lag."""
-    # v_g = a / g; s = v / g below it, else (v² - v_g²) / 2 a + v_g / g
-    gentle_mps = most_mps2 / parameters.brake_gain_1ps  # below this speed it brakes by less
-    if speed_mps <= gentle_mps:
-        return speed_mps / parameters.brake_gain_1ps
-    return (speed_mps**2 - gentle_mps**2) / (2.0 * most_mps2) + gentle_mps / parameters.brake_gain_1ps
-
-
 def compute_return_accel(off_m: Vec3, velocity_mps: Vec3) -> Vec3:
     """Compute the acceleration [m/s²] that brings a vehicle gently back to its place; zero in an axis that is NaN."""
     # a = -k_p (p - p_0) - k_v v, each axis within ±1 m/s²

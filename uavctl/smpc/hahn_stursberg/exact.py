@@ -209,7 +209,7 @@ class ConicSolver:
 
         Numbers that are not finite give an answer FAILED, as does a solver that breaks down; nothing is raised.
         """
-        if not is_finite(x, target, preview) or preview.age > len(self._design.late):
+        if not is_finite(x, target, preview) or not 0 <= preview.age <= len(self._design.late):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         if preview.age:
             return self._find_late_solver(preview.age).solve(seq, x, target, structs.replace(preview, age=0))
