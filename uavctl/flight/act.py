@@ -72,7 +72,7 @@ def _make_setpoint(
         return None, None
     wanted = ZERO
     if fallback is not None:
-        wanted = _compute_fallback_accel(fallback, state, context, supervised, decided)
+        wanted = _compute_fallback_accel(fallback, context, supervised, decided)
     elif plan is not None:
         wanted = controller.plant.to_accel(np.array(plan.inputs[context.step - plan.seq]))
     is_level = fallback is not None and fallback.reason is FallbackReason.ENVELOPE
@@ -98,11 +98,9 @@ def _compute_yaw(state: ControlState, context: TickContext, decided: Decided) ->
     )
 
 
-def _compute_fallback_accel(
-    fallback: Fallback, state: ControlState, context: TickContext, supervised: Supervised, decided: Decided
-) -> Vec3:
+def _compute_fallback_accel(fallback: Fallback, context: TickContext, supervised: Supervised, decided: Decided) -> Vec3:
     """Compute the acceleration that the fallback wants [m/s²]."""
-    moving, _ = find_braking_velocity(state, context, supervised)
+    moving, _ = find_braking_velocity(context, supervised)
     brake = compute_brake_accel(fallback, context.at_ns, moving, context.controller.fallback)
     hold = find_hold_accel(fallback, decided.biases, context, supervised)
     back = find_return_accel(fallback, decided.hold_point_m, supervised.view, context.controller.plant)

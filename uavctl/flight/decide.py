@@ -32,7 +32,6 @@ from uavctl.flight.fallback import (
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
-from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
@@ -373,7 +372,7 @@ def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Deci
 def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     """Advance the fallback to this tick."""
     state, context, view = phase.state, phase.context, phase.view
-    moving, measured = find_braking_velocity(state, context, phase.supervised)
+    moving, measured = find_braking_velocity(context, phase.supervised)
     is_predicted = not (measured or carries_estimate(fallback, view.belief))
     return advance_fallback(
         fallback,
@@ -420,16 +419,13 @@ def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, su
     return north, east, down
 
 
-def find_braking_velocity(state: ControlState, context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
+def find_braking_velocity(context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
     """Find the velocity to brake on, and whether it is the vehicle's own; else it is the predicted one."""
     estimate, plant = supervised.view.estimate, context.controller.plant
     predicted = read_velocity(estimate, plant)
-    observation = None
-    if context.inputs.motion is not None:
-        observation = observe_velocity(state, supervised.monitors.engaged, estimate, context)
-    is_believed = observation is not None and judge_vehicle_velocity(observation).is_none
-    own = read_vehicle_velocity(context.inputs.motion, context.at_ns) if is_believed else None
-    if own is None:
+    observation = observe_velocity(supervised.monitors.engaged, estimate, context)
+    if observation is None or observation.own_mps is None or not judge_vehicle_velocity(observation).is_none:
         return predicted, False
+    own = observation.own_mps
     north, east, down = (v if axis in plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))
     return (north, east, down), True

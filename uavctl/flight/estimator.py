@@ -69,7 +69,7 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
     origin_ns: int  # A boundary of the Δt grid [ns]
     window_begin_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
     anchor: FilterState  # state of the filter at the begin of the window
-    entries: tuple[FilterEvent, ...] = ()  # entries since then, sorted by key
+    entries: Sequence[FilterEvent] = ()  # entries since then, sorted by key
     states: list[FilterState] = []  # states of the filter after the first entries, as far as they are known
 
     @property
@@ -364,12 +364,13 @@ def _find_place(entries: Sequence[FilterEvent], key: Key) -> int:
 
 def _insert(history: FilterHistory, new: FilterEvent) -> FilterHistory:
     """Sort an entry in; the states from there on are not known any more."""
-    entries, place = history.entries, _find_place(history.entries, new.key)
+    entries, place = [*history.entries], _find_place(history.entries, new.key)
+    entries.insert(place, new)
     return FilterHistory(
         origin_ns=history.origin_ns,
         window_begin_ns=history.window_begin_ns,
         anchor=history.anchor,
-        entries=(*entries[:place], new, *entries[place:]),
+        entries=entries,
         states=history.states[:place],
     )
 
@@ -379,7 +380,7 @@ def _keep_entries(history: FilterHistory, kept: Sequence[FilterEvent]) -> Filter
     same = 0
     while same < len(kept) and kept[same] is history.entries[same]:
         same += 1
-    return replace(history, entries=tuple(kept), states=history.states[:same])
+    return replace(history, entries=kept, states=history.states[:same])
 
 
 def _apply_entry(

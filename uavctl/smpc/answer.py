@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Protocol
 
 import msgspec
@@ -78,8 +77,7 @@ def are_finite(arrays: Iterable[Array]) -> bool:
     return all(math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all()) for values in arrays)
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
+class Answer(msgspec.Struct, frozen=True, eq=False):
     """Optimal plan from one state, for the whole plant; one row a step Δt."""
 
     seq: int  # number of the question

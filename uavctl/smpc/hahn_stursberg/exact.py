@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -126,7 +126,7 @@ def add_relaxed(design: Design, answer: Answer, components: Sequence[Component],
     """Add the relaxed constraints to an answer, if there are any."""
     if max(answer.slack, answer.terminal_miss) <= KEPT_TOLERANCE and preview.limits is None:
         return answer
-    return replace(answer, relaxed=find_relaxed(design, answer, components, preview))
+    return structs.replace(answer, relaxed=find_relaxed(design, answer, components, preview))
 
 
 def find_relaxed(
