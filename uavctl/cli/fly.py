@@ -143,7 +143,7 @@ def fly_daemon(
         lock_vehicle(config.daemon.vehicle) as vehicle_lock,
         open_listener(find_control_folder(control), make_daemon_name(config)) as listener,
         open_viewers(view_port) as viewers,
-        create_recording(out, config.name, config.log.free_bytes) as path,
+        create_recording(out, config.name, config.log) as path,
     ):
         with locate_design_errors(loaded):
             design = build_flight_design(config)
@@ -183,7 +183,7 @@ def fly_daemon(
                     run_services(loop, config, path, recorder.status, listener) as service_functions,
                     record_failure(loop),
                     limit_ticks() as tick_limit,
-                    guard_landing(loop, config, connections[VEHICLE], print_warning) as guard_functions,
+                    guard_landing(loop, config, connections[VEHICLE], path, print_warning) as guard_functions,
                 ):
                     is_stop_requested = run_daemon(
                         loop,

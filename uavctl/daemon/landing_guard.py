@@ -10,6 +10,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import msgspec
 
@@ -81,11 +82,11 @@ class LandingGuard:
 
 @contextmanager
 def guard_landing(
-    loop: ControlLoop, config: Config, connection: Connection, report: Callable[[str], None]
+    loop: ControlLoop, config: Config, connection: Connection, recording: Path, report: Callable[[str], None]
 ) -> Iterator[Sequence[Callable[[Ticked, int], None]]]:
     """Yield the functions to call after each tick; none where the process cannot be started, which is reported."""
     hand_over = config.hand_over
-    arguments = (hand_over.answer_s, hand_over.land_s, config.daemon.system_id, config.daemon.component_id)
+    arguments = (hand_over.answer_s, hand_over.land_s, config.daemon.system_id, config.daemon.component_id, recording)
     try:
         helper = HelperProcess("uavctl.daemon.landing_host", [str(argument) for argument in arguments], stderr=None)
     except OSError as error:
