@@ -83,7 +83,8 @@ def fly(
 
     Ctrl-C and the end of --duration brake and hold. Then the vehicle's own landing is requested (`fallback.land`; else
     the pilot takes the vehicle). The program ends once that landing has begun; after --takeoff, or where it passes
-    positions on to the vehicle, once the vehicle is disarmed. A second Ctrl-C ends it at once, without landing.
+    positions on to the vehicle, once the vehicle is disarmed. A second Ctrl-C ends it at once; another process then
+    asks for the landing.
     With --arm --takeoff HEIGHT the vehicle on the ground is armed, climbs by itself, and is flown from there.
 
     Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot

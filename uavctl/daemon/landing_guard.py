@@ -2,7 +2,8 @@
 
 1. The flight gives it the frames, the vehicle's address and the open connection, at once and then twice a second, as
    long as the vehicle would have to be landed if control failed. Each tick is a sign of life.
-2. If the flight's process dies, or gives no sign of life for long, `uavctl.daemon.landing_host` asks for landing.
+2. If the flight's process dies, gives no sign of life for long, or is ended at once by a second signal,
+   `uavctl.daemon.landing_host` asks for landing.
 """
 
 from __future__ import annotations
@@ -79,6 +80,10 @@ class LandingGuard:
             self._helper.socket.send(END)
         self._helper.close()
 
+    def leave(self) -> None:
+        """Leave the vehicle to the process, which finds that the flight has ended."""
+        self._helper.socket.close()
+
 
 @contextmanager
 def guard_landing(
@@ -96,5 +101,10 @@ def guard_landing(
     guard = LandingGuard(helper, loop, connection, round(hand_over.answer_s * SECOND_NS))
     try:
         yield (guard.after_tick,)
-    finally:
+    except SystemExit:  # the second signal of the operator: nothing here waits for the landing
+        guard.leave()
+        raise
+    except BaseException:
         guard.close()
+        raise
+    guard.close()

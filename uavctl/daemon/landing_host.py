@@ -3,7 +3,7 @@
 1. Take what a landing needs from FEED, the number of a socket; see `uavctl.daemon.landing_guard`.
 2. Kill the flight's process if it gives no sign of life for `SILENCE_S`: a process that does no tick hears no pilot.
 3. Once it has died, read what the vehicle says, and ask it to land until it has accepted, or does not fly for us.
-4. Say that it has died, how that ended, and how to read its recording.
+4. Say that it has ended, how that ended, and how to read its recording.
 """
 
 from __future__ import annotations
@@ -118,12 +118,12 @@ def main(arguments: list[str]) -> int:
         if not feed.wait_for_death(flight):
             return 0
     if feed.landing.requests and feed.descriptor >= 0:
-        _tell("error: the flight's process has died in the air; landing is asked for")
+        _tell("error: the flight's process has ended in the air; landing is asked for")
         land(feed.landing, feed.descriptor, request)
         _tell("ended: the vehicle lands, or is not ours any more" if request.is_answered else "ended: no answer")
     else:
-        _tell("error: the flight's process has died; no landing was needed")
-    _tell(f"recording: breaks off; `uavctl log report {recording}` says how far it goes, and draws its page")
+        _tell("error: the flight's process has ended; no landing is asked for")
+    _tell(f"recording: `uavctl log report {recording}` says how far it goes, and draws its page")
     return 0
 
 
