@@ -436,15 +436,14 @@ def stop_and_go(flight: Flight) -> None:
     flight.send(signal.SIGCONT)
 
 
-def end_and_stall(flight: Flight) -> None:
-    """Ask for the end, and let the process stand still again and again, longer than a vehicle waits for setpoints."""
-    flight.send(signal.SIGTERM)
-    for _ in range(6):
+def starve(flight: Flight) -> None:
+    """Let the process stand still again and again, longer than a PX4 waits for setpoints."""
+    for _ in range(15):
         if flight.fly.poll() is None:
             flight.send(signal.SIGSTOP)
-            time.sleep(1.0)
+            time.sleep(0.8)
             flight.send(signal.SIGCONT)
-            time.sleep(0.5)
+            time.sleep(0.1)
 
 
 def lower_memory(flight: Flight) -> None:
@@ -592,12 +591,12 @@ CASES = {
     "int-twice": Case(interrupt_twice, code=130),
     "term-before-arming": Case(signals(signal.SIGTERM), moment="start", code=1),
     "hup-before-arming": Case(signals(signal.SIGHUP), moment="start", code=1),
-    "term-in-climb": Case(signals(signal.SIGTERM), moment="climb"),
-    "hup-in-climb": Case(signals(signal.SIGHUP), moment="climb"),
+    "term-in-climb": Case(signals(signal.SIGTERM), moment="climb", code=1),
+    "hup-in-climb": Case(signals(signal.SIGHUP), moment="climb", code=1),
     "hup-in-landing": Case(signals(signal.SIGHUP), moment="landing"),
     "int-in-landing": Case(signals(signal.SIGINT), moment="landing"),
     "ctrl-z": Case(stop_and_go, stops=False),
-    "stalls-at-end": Case(end_and_stall),
+    "starved": Case(starve, stops=False, code=1),
     "stderr-full": Case(signals(signal.SIGTERM), stderr="full"),
     "stdout-full": Case(signals(signal.SIGTERM), stdout="full", code=1),
     "both-full": Case(signals(signal.SIGTERM), stdout="full", stderr="full", json=False, code=1),
