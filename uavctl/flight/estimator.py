@@ -222,6 +222,19 @@ def drop_samples(history: FilterHistory, dropped: Callable[[PositionSample], boo
     )
 
 
+def weaken_samples(history: FilterHistory, std_m: float) -> FilterHistory:
+    """Let samples of the window count with this standard deviation [m] at least, as if they had come with it."""
+    return _keep_entries(
+        history,
+        [
+            entry
+            if entry.sample is None or entry.sample.std_m >= std_m
+            else replace(entry, sample=replace(entry.sample, std_m=std_m))
+            for entry in history.entries
+        ],
+    )
+
+
 def note_input(history: FilterHistory, at_ns: int, u: Array | None, belief: Belief | None = None) -> FilterHistory:
     """Note that an input acts from now on.
 
@@ -376,7 +389,7 @@ def _insert(history: FilterHistory, new: FilterEvent) -> FilterHistory:
 
 
 def _keep_entries(history: FilterHistory, kept: Sequence[FilterEvent]) -> FilterHistory:
-    """Drop all other entries; the states from the first one dropped on are not known any more."""
+    """Keep these entries only; the states from the first change on are not known any more."""
     same = 0
     while same < len(kept) and kept[same] is history.entries[same]:
         same += 1
