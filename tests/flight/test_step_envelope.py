@@ -30,11 +30,9 @@ from uavctl.event_codes import EventCode
 from uavctl.flight import measure
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import Fallback, FallbackReason
-from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import end_plans
 from uavctl.flight.state import ControlState, FallbackGroup, MonitorGroup
 from uavctl.flight.supervise import distrusts_positions
-from uavctl.flight.tick import make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, InertialSample, StepInput, Vec3, VehicleStatus
 
@@ -212,26 +210,3 @@ def test_inertial_data_that_are_no_numbers_are_nothing_that_the_vehicle_feels() 
     assert any(found)
     assert not any(climbing(None))
     assert climbing((float("nan"), 0.0, 0.0)) == climbing(None)
-
-
-@pytest.mark.fault(94)
-@pytest.mark.parametrize("wrong", ["velocity", "inertial data", "nothing"])
-def test_a_source_found_wrong_in_a_silence_ends_the_flight_on_plans(wrong: str) -> None:
-    horizon_ticks, ours = make_controller().horizon * TICKS, controller()
-    begun = 5 * TICKS + horizon_ticks
-    silent = [one for one in make_step_samples(steps=200) if not 5 <= (one.captured_ns - START_NS) // DT_NS < 60]
-    state, inputs = make_initial_state(), make_inputs(range(60 * TICKS), silent)
-    for inp in inputs[: begun + TICKS]:
-        state, _ = run_tick(state, inp, ours)
-    assert state.mode is ControlMode.BRAKE
-    at_ns = inputs[begun + TICKS].at_ns
-    found = VelocityChangeState(
-        velocity_wrong_ns=at_ns if wrong == "velocity" else None,
-        inertial_wrong_ns=at_ns if wrong == "inertial data" else None,
-    )
-    engaged = replace(state.monitors.engaged, velocity_change=found)
-    state = replace(state, monitors=replace(state.monitors, engaged=engaged))
-    state, _ = run_tick(state, inputs[begun + TICKS], ours)
-    assert state.fallback.flown is not None
-    wanted = FallbackReason.RECOVER if wrong == "nothing" else FallbackReason.SOURCE_FAILED
-    assert state.fallback.flown.reason is wanted
