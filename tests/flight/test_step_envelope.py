@@ -30,9 +30,11 @@ from uavctl.event_codes import EventCode
 from uavctl.flight import measure
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import Fallback, FallbackReason
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import end_plans
 from uavctl.flight.state import ControlState, FallbackGroup, MonitorGroup
 from uavctl.flight.supervise import distrusts_positions
+from uavctl.flight.tick import make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, InertialSample, StepInput, Vec3, VehicleStatus
 
@@ -210,3 +212,24 @@ def test_inertial_data_that_are_no_numbers_are_nothing_that_the_vehicle_feels() 
     assert any(found)
     assert not any(climbing(None))
     assert climbing((float("nan"), 0.0, 0.0)) == climbing(None)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("is_wrong", [True, False])
+@pytest.mark.parametrize("is_silent", [True, False])
+def test_a_velocity_found_wrong_in_a_silence_ends_the_flight_on_plans(is_wrong: bool, is_silent: bool) -> None:
+    ours, last = controller(), 5 + make_controller().horizon + 1
+    samples = make_step_samples(range(5, last + 1), steps=last + 1)
+    state, inputs = make_initial_state(), make_inputs(range((last + 1) * TICKS), samples)
+    for inp in inputs[: last * TICKS]:
+        state, _ = run_tick(state, inp, ours)
+    assert state.mode is ControlMode.BRAKE
+    inp = inputs[last * TICKS]
+    fresh = (sample(inp.at_ns - 10 * MS, inp.at_ns),)
+    found = VelocityChangeState(velocity_wrong_ns=inp.at_ns if is_wrong else None)
+    engaged = replace(state.monitors.engaged, velocity_change=found)
+    state = replace(state, monitors=replace(state.monitors, engaged=engaged))
+    state, _ = run_tick(state, replace(inp, samples=() if is_silent else fresh), ours)
+    assert state.fallback.flown is not None
+    wanted = FallbackReason.VELOCITY_WRONG if is_wrong and is_silent else FallbackReason.RECOVER
+    assert state.fallback.flown.reason is wanted

@@ -51,6 +51,7 @@ COMPARED_NS = CORRECTS_NS + 400_000_000
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL_TEXTS = {
+    FallbackReason.VELOCITY_WRONG: "no position came, and the vehicle's own velocity was found wrong",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
     FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
     FallbackReason.ENVELOPE: "what is seen cannot be",
@@ -114,6 +115,8 @@ def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
     fallback = ordered.fallback
     for reason in supervised.fallback_reasons:
         fallback = request_fallback(fallback, reason, at_ns)
+    if fallback is not None and _is_velocity_wrong(phase):
+        fallback = request_fallback(fallback, FallbackReason.VELOCITY_WRONG, at_ns)
     before, outliers = state.fallback.flown, state.estimator.sources.outliers
     is_final = fallback is not None and fallback.is_final
     becomes_final = is_final and not (before is not None and before.is_final)
@@ -382,6 +385,13 @@ def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
         is_open_loop=is_predicted and are_positions_lost(view.belief, context.at_ns),
         is_blind=is_predicted and (view.age_steps is None or view.age_steps >= context.controller.horizon),
     )
+
+
+def _is_velocity_wrong(phase: _Phase) -> bool:
+    """Whether no position comes, and the vehicle's own velocity was found wrong."""
+    supervised = phase.supervised
+    is_wrong = supervised.monitors.engaged.velocity_change.velocity_wrong_ns is not None
+    return is_wrong and are_positions_lost(supervised.view.belief, phase.context.at_ns)
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
