@@ -116,16 +116,15 @@ class Case:
 
     act: Callable[[Flight], None]
     options: tuple[str, ...] = ()
-    dies: bool = False  # the process may die at once; the vehicle has to come down all the same
+    code: int = 0  # exit code of the process
+    dies: bool = False  # the process dies at once; the vehicle has to come down all the same
     moment: str = "moving"  # or `start`, `climb`, `landing`
-    codes: tuple[int, ...] = (0, 1)
     natnet: bool = False
     controller: str = ""
     stderr: str = "file"  # or `full`, `closed`, `gone`
     stdout: str = "file"
     json: bool = True
     small_disk: bool = False
-    closes: bool = True  # the recording can be closed
     replays: bool = True
     stops: bool = True  # the act ends the flight; else SIGTERM follows after some seconds
     flies_on: bool = False  # the flight has to go on until then
@@ -347,7 +346,7 @@ def fly(name: str, autopilot: str, case: Case, folder: Path) -> dict[str, Any]:
             wrong.append("the process does not end")
             flight.fly.kill()
         row["code"] = flight.fly.wait()
-        if has_ended and not case.dies and row["code"] not in case.codes:
+        if has_ended and row["code"] != case.code:
             wrong.append(f"exit code {row['code']}")
         judge(flight, act_ns, row)
     finally:
@@ -380,7 +379,7 @@ def judge(flight: Flight, act_ns: int, row: dict[str, Any]) -> None:
     (flight.folder / "flag").unlink(missing_ok=True)
     files = sorted((flight.folder / "out").glob("flight*.mcap"))
     row["closed"] = bool(files) and all(file.read_bytes().endswith(CLOSED) for file in files)
-    if not row["closed"] and case.closes and not case.dies:
+    if not row["closed"] and not case.dies:
         wrong.append("the recording is not closed")
     if case.replays:
         environ = {**os.environ, "PYTHONPATH": os.pathsep.join([str(flight.folder / "hook"), str(ROOT)])}
@@ -393,7 +392,7 @@ def judge(flight: Flight, act_ns: int, row: dict[str, Any]) -> None:
                 timeout=120.0,
             )
             row["replay"] = replay.returncode
-            if replay.returncode not in ((0, 3) if case.dies else (0,)):
+            if replay.returncode:
                 wrong.append(f"replay {replay.returncode}: {(replay.stdout + replay.stderr).strip()[-300:]}")
         except subprocess.TimeoutExpired:
             wrong.append("the replay does not end")
@@ -409,7 +408,7 @@ def read_sentence(flight: Flight, row: dict[str, Any]) -> str:
     if flight.case.json and output.exists():
         text = output.read_text(errors="replace")
         if not text.strip():
-            if not flight.case.dies:
+            if flight.case.code in (0, 1):  # else it has ended at once
                 row["wrong"].append("no document")
         else:
             try:
@@ -437,10 +436,20 @@ def stop_and_go(flight: Flight) -> None:
     flight.send(signal.SIGCONT)
 
 
+def starve(flight: Flight) -> None:
+    """Let the process stand still again and again, longer than a PX4 waits for setpoints."""
+    for _ in range(15):
+        if flight.fly.poll() is None:
+            flight.send(signal.SIGSTOP)
+            time.sleep(0.8)
+            flight.send(signal.SIGCONT)
+            time.sleep(0.1)
+
+
 def lower_memory(flight: Flight) -> None:
-    """Leave the process a megabyte of address space."""
+    """Let the process get no memory any more, whatever it gives back: its limit is half of what it has."""
     pages = int(Path(f"/proc/{flight.fly.pid}/statm").read_text().split()[0])
-    flight.set_limit(resource.RLIMIT_AS, pages * resource.getpagesize() + 2**20)
+    flight.set_limit(resource.RLIMIT_AS, pages * resource.getpagesize() // 2)
 
 
 def take_descriptors(flight: Flight) -> None:
@@ -486,6 +495,13 @@ def has_child(flight: Flight, words: str) -> bool:
     except AssertionError:
         return False
     return True
+
+
+def interrupt_twice(flight: Flight) -> None:
+    """Press Ctrl-C twice; two signals at the same time would be one."""
+    flight.send(signal.SIGINT)
+    time.sleep(0.4)
+    flight.send(signal.SIGINT)
 
 
 def send_garbage(flight: Flight) -> None:
@@ -537,10 +553,12 @@ def failing(*a, **k): raise MemoryError
 ControlLoop.tick = failing
 """
 DEAD_RECORDER = """
-import logs.recording.recorder as r, threading, ctypes
-for t in threading.enumerate():
-    if "record" in t.name.lower():
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(t.ident), ctypes.py_object(MemoryError))
+from logs.recording.recorder import WriteQueue
+plain = WriteQueue.drain
+def dies(*a, **k):
+    WriteQueue.drain = plain
+    raise SystemExit
+WriteQueue.drain = dies
 """
 CLOCK_STEP = """
 import time
@@ -553,25 +571,43 @@ CRASH = "import ctypes; ctypes.string_at(0)"
 CASES = {
     **{
         name: Case(signals(getattr(signal, name)))
-        for name in ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGXCPU"]
+        for name in (
+            [
+                "SIGINT",
+                "SIGTERM",
+                "SIGHUP",
+                "SIGQUIT",
+                "SIGUSR1",
+                "SIGUSR2",
+                "SIGALRM",
+                "SIGVTALRM",
+                "SIGPROF",
+                "SIGXCPU",
+            ]
+        )
     },
-    "SIGPIPE": Case(signals(signal.SIGPIPE), stops=False),
+    "SIGPIPE": Case(signals(signal.SIGPIPE), stops=False, flies_on=True),
     "two-signals": Case(signals(signal.SIGHUP, signal.SIGTERM)),
-    "int-twice": Case(signals(signal.SIGINT, signal.SIGINT), dies=True),
-    "term-in-climb": Case(signals(signal.SIGTERM), moment="climb"),
-    "term-before-arming": Case(signals(signal.SIGTERM), moment="start"),
+    "int-twice": Case(interrupt_twice, code=130),
+    "term-before-arming": Case(signals(signal.SIGTERM), moment="start", code=1),
+    "hup-before-arming": Case(signals(signal.SIGHUP), moment="start", code=1),
+    "term-in-climb": Case(signals(signal.SIGTERM), moment="climb", code=1),
+    "hup-in-climb": Case(signals(signal.SIGHUP), moment="climb", code=1),
     "hup-in-landing": Case(signals(signal.SIGHUP), moment="landing"),
+    "int-in-landing": Case(signals(signal.SIGINT), moment="landing"),
     "ctrl-z": Case(stop_and_go, stops=False),
+    "starved": Case(starve, stops=False, code=1),
     "stderr-full": Case(signals(signal.SIGTERM), stderr="full"),
-    "stdout-full": Case(signals(signal.SIGTERM), stdout="full"),
-    "both-full": Case(signals(signal.SIGTERM), stdout="full", stderr="full", json=False),
-    "stdout-gone": Case(signals(signal.SIGTERM), stdout="gone"),
+    "stdout-full": Case(signals(signal.SIGTERM), stdout="full", code=1),
+    "both-full": Case(signals(signal.SIGTERM), stdout="full", stderr="full", json=False, code=1),
+    "stdout-gone": Case(signals(signal.SIGTERM), stdout="gone", code=1),
     "stderr-closed": Case(signals(signal.SIGTERM), stderr="closed"),
     "descriptors": Case(take_descriptors, stops=False, flies_on=True),
-    "memory": Case(lower_memory, stops=False),
-    "disk-full": Case(fill_disk, stops=False, flies_on=True, small_disk=True, closes=False),
-    "file-size": Case(limit_files, stops=False, closes=False),
-    "folder-removed": Case(remove_folder, stops=False, flies_on=True, replays=False),
+    "memory": Case(lower_memory, stops=False, code=1),
+    "disk-full": Case(fill_disk, stops=False, flies_on=True, small_disk=True, code=1),
+    "file-size": Case(limit_files, stops=False, flies_on=True, code=1),
+    "file-size-in-climb": Case(limit_files, moment="climb", stops=False, code=1),
+    "folder-removed": Case(remove_folder, stops=False, flies_on=True, replays=False, code=1),
     "camera-killed": Case(kill_child("uavctl.io.camera_host"), natnet=True, stops=False),
     "camera-killed-5": Case(kill_child("uavctl.io.camera_host", 5), natnet=True, stops=False),
     "live-killed": Case(
@@ -583,18 +619,24 @@ CASES = {
     "garbage": Case(send_garbage, stops=False, flies_on=True),
     "threads-refused": Case(inject(REFUSED_THREADS), stops=False, flies_on=True),
     "clock-step": Case(inject(CLOCK_STEP), stops=False, flies_on=True),
-    "recorder-thread": Case(inject(DEAD_RECORDER), stops=False, flies_on=True, is_defect=True, closes=False),
-    "select-fails": Case(inject(FAILING_SELECT), codes=(1,), is_defect=True),
-    "tick-fails": Case(inject(FAILING_TICK), codes=(1,), is_defect=True),
-    "controller-raises": Case(raise_flag, controller="Raises", codes=(1,), replays=False),
-    "controller-loops": Case(raise_flag, controller="Loops", codes=(1,)),
-    "controller-sleeps": Case(raise_flag, controller="Sleeps", codes=(1,)),
-    "controller-swallows": Case(raise_flag, controller="Swallows", dies=True, replays=False),
-    "controller-holds": Case(raise_flag, controller="Holds", dies=True, replays=False),
-    "controller-allocates": Case(raise_flag, controller="Allocates", codes=(1,), replays=False),
-    "SIGKILL": Case(signals(signal.SIGKILL), dies=True),
-    "SIGSEGV": Case(signals(signal.SIGSEGV), dies=True),
-    "SIGABRT": Case(signals(signal.SIGABRT), dies=True),
+    "recorder-thread": Case(inject(DEAD_RECORDER), stops=False, flies_on=True),
+    "select-fails": Case(inject(FAILING_SELECT), code=1, is_defect=True),
+    "tick-fails": Case(inject(FAILING_TICK), code=1, is_defect=True),
+    "tick-fails-in-climb": Case(inject(FAILING_TICK), moment="climb", code=1, is_defect=True),
+    "tick-fails-in-landing": Case(inject(FAILING_TICK), moment="landing", code=1, is_defect=True),
+    "controller-raises": Case(raise_flag, controller="Raises", code=1, replays=False),
+    "controller-loops": Case(raise_flag, controller="Loops", code=1),
+    "controller-sleeps": Case(raise_flag, controller="Sleeps", code=1),
+    "controller-swallows": Case(raise_flag, controller="Swallows", dies=True, replays=False, code=-9),
+    "controller-holds": Case(raise_flag, controller="Holds", dies=True, replays=False, code=-9),
+    "controller-allocates": Case(raise_flag, controller="Allocates", code=1, replays=False),
+    "SIGKILL": Case(signals(signal.SIGKILL), dies=True, code=-9),
+    "kill-before-arming": Case(signals(signal.SIGKILL), moment="start", dies=True, replays=False, code=-9),
+    "kill-in-climb": Case(signals(signal.SIGKILL), moment="climb", dies=True, code=-9),
+    "kill-in-landing": Case(signals(signal.SIGKILL), moment="landing", dies=True, code=-9),
+    "SIGSTOP": Case(signals(signal.SIGSTOP), dies=True, code=-9),
+    "SIGSEGV": Case(signals(signal.SIGSEGV), dies=True, code=-11),
+    "SIGABRT": Case(signals(signal.SIGABRT), dies=True, code=-6),
 }
 
 

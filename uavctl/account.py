@@ -60,6 +60,12 @@ def report_lost_records(ending: Ending, records: int, reason: str) -> Ending:
     return replace(ending, as_ordered=False, exit_code=ending.exit_code or 1, sentence=text)
 
 
+def report_failed_writes(ending: Ending, reason: str) -> Ending:
+    """Return the ending of a flight whose recording is complete, but could not be written as it should."""
+    text = f"{ending.sentence.removesuffix('.')}; writing the recording failed ({reason}), and no record is lost."
+    return replace(ending, as_ordered=False, exit_code=ending.exit_code or 1, sentence=text)
+
+
 def make_ending(cause: Cause, text: str, *, as_ordered: bool | None = None, exit_code: int | None = None) -> Ending:
     """Make an ending of one sentence; whether it is as ordered follows from its cause, unless given."""
     good = cause in WANTED if as_ordered is None else as_ordered

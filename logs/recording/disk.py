@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -152,3 +153,21 @@ def check_free_space(path: Path, free_bytes: int) -> int:
             "make room, choose another folder, or lower log.free_bytes"
         )
     return free
+
+
+# Beyond `segment_bytes` a file has its header, its last chunk, index and footer: together some per cent.
+_FILE_SHARE = 1.2
+
+
+def check_file_limit(segment_bytes: int) -> None:
+    """Check that files may grow to the size at which a recording goes on in the next one.
+
+    Raises:
+        RecordingError: The process's limit of file sizes is lower.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if limit != resource.RLIM_INFINITY and limit < _FILE_SHARE * segment_bytes:
+        raise RecordingError(
+            f"files may grow to {limit} bytes only, and log.segment_bytes = {segment_bytes} needs more; "
+            f"raise that limit (`ulimit -f unlimited`), or set log.segment_bytes to {int(limit / _FILE_SHARE)} or less"
+        )

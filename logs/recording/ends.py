@@ -10,14 +10,15 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from logs.recording.disk import check_free_space
+from logs.recording.disk import check_file_limit, check_free_space
 from logs.recording.output_files import remove_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER
-from uavctl.account import report_lost_records
+from uavctl.account import report_failed_writes, report_lost_records
 from uavctl.build.controller import Prepared, collect_versions, make_design_record, read_cpu_model
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
+from uavctl.config.types import LogConfig
 from uavctl.records import Ending, Header, Sink
 
 
@@ -29,15 +30,16 @@ def make_recording_path(out: Path | None, name: str) -> Path:
 
 
 @contextmanager
-def create_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path]:
+def create_recording(out: Path | None, name: str, log: LogConfig) -> Iterator[Path]:
     """Yield the path of a new recording, with room checked; folders made for it are removed if they stay empty.
 
     Raises:
-        RecordingError: as `check_free_space` does.
+        RecordingError: as `check_free_space` and `check_file_limit` do.
     """
     path = make_recording_path(out, name)
     with remove_empty_folders([path]):
-        check_free_space(path, free_bytes)
+        check_file_limit(log.segment_bytes)
+        check_free_space(path, log.free_bytes)
         yield path
 
 
@@ -75,7 +77,9 @@ def put_header(
 def describe_ending(ending: Ending, status: RecorderStatus) -> Ending:
     """Return how a flight ended, with the state of its recording."""
     reason = status.reason or status.refusal or "the disk was too slow"
-    return ending if status.ok else report_lost_records(ending, max(count_missing_records(status), 1), reason)
+    if not status.ok:
+        return report_lost_records(ending, max(count_missing_records(status), 1), reason)
+    return report_failed_writes(ending, reason) if status.failures else ending
 
 
 def count_missing_records(status: RecorderStatus) -> int:

@@ -493,12 +493,12 @@ def _compute_crc(data: Buffer, end: int, begin: int = 0) -> int:
 
 
 def _is_summary_right(data: Buffer, start: int) -> bool:
-    """Return whether the bytes from `start` on are a summary with the right checksum, footer and magic."""
+    """Return whether the bytes from `start` on are a summary, or none, with the right checksum, footer and magic."""
     at = len(data) - len(MAGIC) - _FOOTER.size
     if at < start or data[at + _FOOTER.size :] != MAGIC:
         return False
     opcode, length, summary_start, _, crc = _FOOTER.unpack_from(data, at)
-    is_footer = opcode == Opcode.FOOTER and length == 20 and summary_start == start
+    is_footer = opcode == Opcode.FOOTER and length == 20 and summary_start == (start if at > start else 0)
     return bool(is_footer and crc == _compute_crc(data, at + _FOOTER.size - _CHECKSUM.size, start))
 
 

@@ -426,10 +426,15 @@ class Recorder(_Base):
 
     def catch_up(self) -> None:
         """Begin a round now: right after a tick, when the control loop has the longest time until the next one."""
+        if not self._thread.is_alive():
+            self._start_thread()
         self._due.set()
 
     def _begin(self) -> None:
         self._stop, self._due = threading.Event(), threading.Event()
+        self._start_thread()
+
+    def _start_thread(self) -> None:
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -439,7 +444,10 @@ class Recorder(_Base):
         self._journal.closed = True
         self._stop.set()
         self._due.set()
-        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+        if not (self._thread.is_alive() or self._journal.finished):
+            self._journal.finish()  # the thread has died, and perhaps none can be started
         return self.status()
 
     def status(self) -> RecorderStatus:

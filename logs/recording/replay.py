@@ -27,12 +27,14 @@ from logs.recording.topics import (
     parse_raw_topic,
     round_plan,
 )
+from uavctl.cause import Cause
 from uavctl.constraint_names import name_constraints
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,
     Datagram,
     Decision,
+    Ending,
     Event,
     InternalError,
     InternalErrorEffect,
@@ -470,7 +472,8 @@ def replay(
         make_loop: builds the loop from the recording's configuration, around the given sink.
         tolerance: largest difference of two numbers that counts as none, relative to the larger
             of 1 and their size; 0 compares bit for bit. For a recording of another arithmetic.
-        finished: the recording was closed in order; a torn one's last tick may lack records.
+        finished: the recording was closed in order; a torn one's last tick may lack records. So may that of a flight
+            that a second signal has ended at once.
         ignored: (topic, field) that may differ; of a vector all entries.
     """
     produced = _Produced()
@@ -494,6 +497,8 @@ def replay(
             loop.handle_failure(record, discard)
         elif isinstance(record, RecorderNote):
             findings.dropped = record.dropped
+        elif isinstance(record, Ending):
+            finished = finished and record.code != Cause.SIGNALLED
         if _is_compared(topic):
             replayed = produced.take(topic, at_ns)
             if (
@@ -551,7 +556,9 @@ def _is_input(topic: str) -> bool:
     link = parse_raw_topic(topic)
     try:
         return (
-            get_record_type(topic) in (StepInput, Refused, InternalError, RecorderNote) if link is None else not link[1]
+            get_record_type(topic) in (StepInput, Refused, InternalError, RecorderNote, Ending)
+            if link is None
+            else not link[1]
         )
     except KeyError:
         return True  # decoding says that nobody knows it

@@ -196,7 +196,7 @@ class Segment:
         self._file.close()
 
     def abandon(self) -> None:
-        """After a failed write: cut off what it left behind, add index and footer if there is room, close.
+        """After a failed write: cut off what it left behind, end the file as well as there is room, close.
 
         Raises:
             OSError: not all of it could be done; the chunks written before are readable all the same.
@@ -207,9 +207,18 @@ class Segment:
                 self._file.write(self._make_tail())
             except OSError:
                 self._file.truncate(self.bytes)
-                raise
+                self._write_short_tail()
         finally:
             self._file.close()
+
+    def _write_short_tail(self) -> None:
+        """End the file without a summary: on a full disk its last block has room for these few bytes, as a rule."""
+        try:
+            crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, 20, 0, 0))
+            self._file.write(_pack_records(DataEnd(self._crc), Footer(0, 0, crc)) + MAGIC)
+        except OSError:
+            self._file.truncate(self.bytes)
+            raise
 
     def close_missing(self) -> None:
         """Close a file that nobody can find any more.

@@ -363,7 +363,7 @@ def test_a_flight_that_breaks_off_leaves_a_whole_recording(
         if ticked.decision.tick == 30:
             raise error
 
-    monkeypatch.setattr(ControlLoop, "timing", fail)
+    monkeypatch.setattr(ControlLoop, "record_timing", fail)
     with pytest.raises(error):
         uavctl.fly(uavctl.load("paper", PAPER), tmp_path, duration_s=20)
     recording = uavctl.read(tmp_path / "flight.mcap")

@@ -42,3 +42,20 @@ def test_a_camera_fault_is_flown_through(kind: str, seed: int, preset: str, auto
     assert not flight.codes.keys() & ENVELOPE_CODES
     assert flight.modes[-1][1] in (ControlMode.TRACK, ControlMode.BRAKE)
     assert flight.outside_m < 0.5
+
+
+@pytest.mark.fault(100)
+@pytest.mark.parametrize(
+    ("seed", "preset", "autopilot", "plant"),
+    [
+        (0, "room", "ardupilot", "quadrotor"),
+        (2, "room", "px4", "linear"),
+        (5, "room", "ardupilot", "quadrotor"),
+        (11, "room-ardupilot", "ardupilot", "quadrotor"),
+    ],
+)
+def test_noise_from_the_first_position_on_is_no_motion(seed: int, preset: str, autopilot: str, plant: str) -> None:
+    """Two or three positions with noise of 5 cm, taken for exact, make a velocity of metres a second."""
+    flight = fly_with_fault("white-5cm", seed, preset, autopilot, "duration_s=5", plant=plant)
+    assert flight.codes is not None and flight.modes is not None
+    assert not flight.codes.keys() & ENVELOPE_CODES and flight.modes[-1][1] == ControlMode.TRACK

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,6 +24,7 @@ from flight_rig import (
     small_plant,
     with_faults,
 )
+from msgspec import structs
 
 from uavctl.records import ControlMode, Severity, SolveStatus
 from uavctl.smpc.answer import Answer
@@ -98,7 +98,7 @@ def test_row_22_a_programming_error_is_not_hidden() -> None:
 @pytest.mark.fault(23)
 @pytest.mark.parametrize("offset", [-1, 1, -4])
 def test_row_23_an_answer_to_another_question_is_discarded(offset: int) -> None:
-    controller, _ = with_faults({3: lambda answer: replace(answer, seq=answer.seq + offset)})
+    controller, _ = with_faults({3: lambda answer: structs.replace(answer, seq=answer.seq + offset)})
     outputs = run(controller, make_inputs(range(5 * TICKS), make_step_samples()))
     assert list_plan_steps(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
     late_output = find_boundaries(outputs)[3]
@@ -110,7 +110,7 @@ def make_spoiled_solver(name: str, value: float) -> Fault:
     def fault(answer: Answer) -> Answer:
         arrays = {"inputs": answer.inputs.copy(), "states": answer.states.copy(), "reference": answer.reference.copy()}
         arrays[name].flat[-1] = value
-        return replace(answer, inputs=arrays["inputs"], states=arrays["states"], reference=arrays["reference"])
+        return structs.replace(answer, inputs=arrays["inputs"], states=arrays["states"], reference=arrays["reference"])
 
     return fault
 
@@ -127,11 +127,11 @@ def test_row_24_an_optimal_answer_that_is_not_finite_does_not_fly(name: str, val
 
 
 WRONG_SHAPES: dict[str, Fault] = {
-    "too few inputs": lambda answer: replace(answer, inputs=answer.inputs[1:]),
-    "inputs of two axes": lambda answer: replace(answer, inputs=np.repeat(answer.inputs, 2, axis=1)),
-    "flat inputs": lambda answer: replace(answer, inputs=answer.inputs[:, 0]),
-    "too few states": lambda answer: replace(answer, states=answer.states[1:]),
-    "too short states": lambda answer: replace(answer, states=answer.states[:, 1:]),
+    "too few inputs": lambda answer: structs.replace(answer, inputs=answer.inputs[1:]),
+    "inputs of two axes": lambda answer: structs.replace(answer, inputs=np.repeat(answer.inputs, 2, axis=1)),
+    "flat inputs": lambda answer: structs.replace(answer, inputs=answer.inputs[:, 0]),
+    "too few states": lambda answer: structs.replace(answer, states=answer.states[1:]),
+    "too short states": lambda answer: structs.replace(answer, states=answer.states[:, 1:]),
 }
 
 
@@ -147,7 +147,7 @@ def test_row_24_an_answer_of_the_wrong_shape_does_not_fly(fault: str) -> None:
 @pytest.mark.fault(24)
 @pytest.mark.parametrize(("value", "sent"), [(50.0, 2.0), (-1e300, -2.0)])
 def test_row_24_an_input_out_of_range_is_clamped_and_recorded_so(value: float, sent: float) -> None:
-    controller, _ = with_faults({3: lambda answer: replace(answer, inputs=np.full_like(answer.inputs, value))})
+    controller, _ = with_faults({3: lambda answer: structs.replace(answer, inputs=np.full_like(answer.inputs, value))})
     output = find_boundaries(run(controller, make_inputs(range(4 * TICKS), make_step_samples())))[3]
     assert output.setpoint is not None
     assert output.setpoint.accel_mps2 == (sent, 0.0, 0.0)
@@ -161,7 +161,7 @@ def test_row_24_every_setpoint_is_sound_under_random_faults_of_all_kinds() -> No
     steps = 1500
     pool: list[Fault] = [inject for inject, _ in SOLVER_FAULTS.values()]
     pool += [make_spoiled_solver("inputs", value) for value in (math.nan, 1e300, -40.0, 3.0)]
-    pool += [lambda answer: replace(answer, seq=answer.seq - 1)]
+    pool += [lambda answer: structs.replace(answer, seq=answer.seq - 1)]
     faults = {n: pool[int(rng.integers(len(pool)))] for n in range(steps) if rng.random() < 0.4}
     samples = []
     for number in range(steps):

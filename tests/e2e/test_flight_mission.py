@@ -258,7 +258,7 @@ def test_a_mission_goes_on_where_it_was_after_the_pilot_had_the_vehicle() -> Non
 
 def test_a_relaxed_plan_is_one_event_with_the_worst_relaxation_and_the_number_of_others() -> None:
     given = tuple(GaveWay(constraint="equilibrium", stage=3, index=i, amount=0.1 * (i + 1)) for i in range(3))
-    solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, relaxed=given)})
+    solver = StubSolver(small_plant(), faults={1: lambda answer: msgspec.structs.replace(answer, relaxed=given)})
     outputs = run(make_controller(solver), make_inputs(range(3 * TICKS), make_step_samples()))
     relaxed_outputs = [(number, output) for number, output in enumerate(outputs) if "gave-way" in list_codes(output)]
     assert [number for number, _ in relaxed_outputs] == [TICKS]

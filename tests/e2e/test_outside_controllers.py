@@ -21,6 +21,7 @@ from uavctl.config import Config, load_config
 from uavctl.records import ControlMode, Ending
 
 MODULE = "outside_controllers"
+OWN_PARTS = Path(__file__).parents[2] / "docs" / "examples" / "own-parts"
 FAILING = ("Raises", "RaisesSoon", "Leaves", "NotFinite", "WrongShape")
 WAY_S = 14.0
 # What fails is let go of by the same code, whatever flies: a linear plant adds nothing to a true vehicle.
@@ -116,6 +117,43 @@ def test_a_good_one_flies_to_the_target(
         observed.wrong == () and observed.outside_m <= 0.0 and observed.modes <= {ControlMode.WAIT, ControlMode.TRACK}
     )
     assert math.dist(observed.place_m, prepared.config.target.position_m) < 0.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_corner", [False, True])
+@pytest.mark.parametrize(
+    ("preset", "autopilot", "from_wall_m"),
+    [
+        ("room", "px4", 0.2),
+        ("room", "ardupilot", 0.2),
+        ("room-px4", "px4", 0.2),
+        ("room-ardupilot", "ardupilot", 0.2),
+        ("room-hahn-stursberg", "px4", 0.8),  # the design of its scheme has no target that is nearer
+        ("room-hahn-stursberg", "ardupilot", 0.8),
+    ],
+)
+def test_the_regulator_of_the_docs_reaches_walls_and_corners_in_gusts(
+    preset: str, autopilot: str, from_wall_m: float, is_corner: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    north_m, east_m = 3.0 - from_wall_m, 2.5 - from_wall_m
+    target_m = (-north_m, east_m, -1.2) if is_corner else (north_m, 0.0, -1.2)
+    monkeypatch.syspath_prepend(str(OWN_PARTS))
+    air = ("sim.plant=quadrotor", "sim.wind.velocity_mps=[0.6,0.4,0.0]", "sim.wind.gust_wind_mps=3.0")
+    target = f"target.position_m={list(target_m)}"
+    config = load_config(preset, ["smpc.controller=own_parts.controller:Careful", target, *air])
+    observed = fly_module(prepare(config, build_flight_design(config)), "quadrotor", autopilot)
+    assert observed.wrong == () and observed.outside_m <= 0.0
+    assert observed.modes <= {ControlMode.WAIT, ControlMode.TRACK}
+    assert math.dist(observed.place_m, target_m) < 0.3
+
+
+@pytest.mark.fault(69)
+@pytest.mark.slow
+@TRUE_WORLDS
+def test_one_that_heeds_no_speed_is_let_go_before_the_wall(plant: str, autopilot: str) -> None:
+    config = load_config("room", [f"smpc.controller={MODULE}:Regulates", "target.position_m=[2.8,0.0,-1.2]"])
+    prepared = prepare(config, build_flight_design(config))
+    assert_let_go(fly_module(prepared, plant, autopilot), "flies at the limit of north")
 
 
 @pytest.mark.fault(69)

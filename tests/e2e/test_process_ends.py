@@ -68,8 +68,8 @@ def test_a_signal_that_would_kill_ends_the_flight_in_order(
 
 @pytest.mark.slow
 @pytest.mark.fault(86)
-@pytest.mark.parametrize("air", ["px4"], indirect=True)
-def test_a_second_deliberate_signal_ends_the_process(air: Scene) -> None:
+@pytest.mark.parametrize("air", AUTOPILOTS, indirect=True)
+def test_a_second_deliberate_signal_ends_the_process_and_the_vehicle_is_landed(air: Scene) -> None:
     with end_process(air.fly("f", "--set", "fallback.brake_s=600", "--set", "fallback.hold_s=600")) as process:
         wait_for_flight(air)
         process.send_signal(signal.SIGTERM)
@@ -78,6 +78,7 @@ def test_a_second_deliberate_signal_ends_the_process(air: Scene) -> None:
         process.communicate(timeout=LIMIT_S)
     assert process.returncode == 128 + signal.SIGQUIT
     assert (air.folder / "f" / "flight.mcap").read_bytes().endswith(CLOSED)
+    wait_until(lambda: air.has_landed, "the vehicle lands")
 
 
 @pytest.mark.slow

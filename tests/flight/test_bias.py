@@ -27,6 +27,7 @@ from flight_rig import (
     stub_inputs,
     vehicle,
 )
+from msgspec import structs
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -208,7 +209,7 @@ class Steady(StubSolver):
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         answer = super().solve(seq, x, target, preview)
-        return replace(answer, inputs=np.full_like(answer.inputs, 0.2))
+        return structs.replace(answer, inputs=np.full_like(answer.inputs, 0.2))
 
 
 def test_the_fallback_brakes_and_holds_against_it() -> None:

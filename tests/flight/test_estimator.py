@@ -34,6 +34,7 @@ from uavctl.flight.estimator import (
     insert_sample,
     note_input,
     predict_belief,
+    weaken_samples,
 )
 from uavctl.flight.kalman import (
     Belief,
@@ -508,3 +509,13 @@ def test_what_the_anchor_holds_is_not_taken_back() -> None:
     history = drop_samples(history, lambda one: True)
     assert history.captured_ns == START_NS
     assert all(one.sample is None for one in history.entries)
+
+
+def test_weakened_samples_count_as_if_they_had_come_with_that_noise() -> None:
+    kalman, begun = make()
+    samples = [sample(START_NS + n * S // 20, std_m=std_m) for n, std_m in enumerate((0.005, 0.08, 0.01))]
+    weak = [changed(one, std_m=max(one.std_m, 0.04)) for one in samples]
+    (sharp, _, _), (blunt, _, _) = (absorb_samples(kalman, begun, START_NS + S, every) for every in (samples, weak))
+    assert told(kalman, sharp) != told(kalman, blunt)
+    assert told(kalman, weaken_samples(sharp, 0.04)) == told(kalman, blunt)
+    assert weaken_samples(sharp, 0.005).entries == sharp.entries

@@ -49,7 +49,7 @@ class Steering(StubSolver):
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         answer = super().solve(seq, x, target, preview)
         u = float(np.clip(self.gain * (self.want(seq) - x[0]) - 1.2 * x[1] - 0.3 * x[2], -1.5, 1.5))
-        return replace(answer, inputs=np.full_like(answer.inputs, u))
+        return msgspec.structs.replace(answer, inputs=np.full_like(answer.inputs, u))
 
 
 def fly(

@@ -44,6 +44,16 @@ def test_noise_is_measured(std_m: float) -> None:
     assert np.median(sizes) == pytest.approx(std_m, rel=0.15)
 
 
+@pytest.mark.parametrize(("count", "factor"), [(3, 3.8), (4, 2.3), (5, 1.8), (17, 1.0)])
+def test_few_positions_may_have_shown_too_little_noise(count: int, factor: float) -> None:
+    """Positions to and fro by 3 cm leave 3 cm / √1.5 as residuals: 1.6 cm as the noise of an axis."""
+    offsets = np.zeros((count, 3))
+    offsets[::2, 0] = 0.03
+    track = measure_noise(offsets)
+    assert track.std_m == pytest.approx(factor * 0.0159, rel=0.01) and track.is_known == (count > 4)
+    assert measure_noise(offsets[:2]).std_m == measure_noise(0.6 * offsets).std_m == 0.0
+
+
 def test_usual_noise_and_acceleration_change_nothing() -> None:
     rng = np.random.default_rng(2)
     for accel_mps2 in (0.0, 4.0):

@@ -40,7 +40,7 @@ def gated(land: bool = True) -> Controller:
     """A controller that believes as in flight, and whose plans ask for nothing, so that a vehicle at rest fits."""
 
     def nothing(answer: Answer) -> Answer:
-        return replace(answer, inputs=answer.inputs * 0.0)
+        return msgspec.structs.replace(answer, inputs=answer.inputs * 0.0)
 
     solver = StubSolver(small_plant(), faults=dict.fromkeys(range(5000), nothing))
     return replace(make_controller(solver, land=land), position_gate=PARAMETERS)

@@ -26,6 +26,7 @@ from flight_rig import (
     stub_inputs,
     vehicle,
 )
+from msgspec import structs
 
 from uavctl.flight.mission import Waypoint
 from uavctl.records import ControlMode, SetpointSource, SolveStatus, VehicleStatus
@@ -122,7 +123,9 @@ def test_a_flight_may_begin_between_boundaries() -> None:
 
 
 def test_the_estimator_knows_the_input_after_the_last_gate() -> None:
-    solver = StubSolver(small_plant(), faults={0: lambda answer: replace(answer, inputs=answer.inputs * 0.0 + 50.0)})
+    solver = StubSolver(
+        small_plant(), faults={0: lambda answer: structs.replace(answer, inputs=answer.inputs * 0.0 + 50.0)}
+    )
     outputs = run(make_controller(solver), make_inputs(range(TICKS + 1), [sample(START_NS, velocity_mps=(0, 0, 0))]))
     begin, end = outputs[0].estimate, outputs[TICKS].estimate
     assert begin is not None

@@ -175,7 +175,9 @@ def test_the_pilot_ends_the_fallback(status: VehicleStatus) -> None:
 
 
 def test_without_any_plan_the_fallback_takes_over_at_once() -> None:
-    solver = StubSolver(small_plant(), faults={0: lambda answer: replace(answer, status=SolveStatus.INFEASIBLE)})
+    solver = StubSolver(
+        small_plant(), faults={0: lambda answer: msgspec.structs.replace(answer, status=SolveStatus.INFEASIBLE)}
+    )
     outputs = run(make_controller(solver), make_inputs(range(1), make_motion_samples(0)))
     assert outputs[0].decision.mode is BRAKE
 

@@ -97,6 +97,17 @@ def test_both_are_wrong_where_neither_changes_as_gusts_allow() -> None:
 
 
 @pytest.mark.fault(94)
+@pytest.mark.parametrize(("turns", "both"), [(False, False), (True, True)])
+def test_a_velocity_that_turns_wrong_is_found_beside_wrong_inertial_data(turns: bool, both: bool) -> None:
+    def own(s: float, v: float) -> float:
+        return v + 5.0 * max(s - LAG_S - 0.5, 0.0) if turns else v
+
+    states = fly(70, own, lambda s, a: -a if s >= LAG_S else a)
+    assert is_found(states[round((LAG_S + 0.5) / 0.05)]) == (False, True)
+    assert is_found(states[-1]) == (both, True)
+
+
+@pytest.mark.fault(94)
 def test_a_velocity_that_repeats_is_found_without_inertial_data_but_not_at_rest() -> None:
     frozen = fly(40, lambda _s, _v: 1.25, lambda _s, _a: None)
     assert is_found(frozen[-1]) == (True, False)

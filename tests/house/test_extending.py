@@ -108,7 +108,8 @@ def test_a_controller_flies_in_flight_campaign_and_what_if_without_an_edit(tmp_p
     cells = {cell["controller"]: cell for cell in document["cells"]}
     assert cells["careful"]["runs"] == 20
     assert cells["careful"]["failed"] == 0
-    assert cells["careful"]["cost"] > cells["ours"]["cost"]  # half of the regulator arrives late
+    # The limits are far: both are the regulator, whose cost is the least.
+    assert cells["careful"]["cost"] == pytest.approx(cells["ours"]["cost"], rel=0.02)
 
 
 @pytest.mark.parametrize(("block", "module"), [("mine.py", "controller.py"), ("lines.py", "source.py")])

@@ -337,6 +337,24 @@ def test_a_second_address_draws_no_setpoints_while_the_first_one_speaks() -> Non
 
 
 @pytest.mark.fault(39)
+def test_a_vehicle_that_has_closed_its_port_gets_its_setpoints_at_another_one() -> None:
+    clock = Clock()
+    with closing(open_connection("udpin://127.0.0.1:0", clock)) as connection, peer() as moved, peer() as thief:
+        with peer() as vehicle:
+            known(connection, vehicle)
+        connection.send(b"setpoint")  # the answer: nobody listens there
+        assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
+        assert connection.receive(read_all=True) == []
+        known(connection, moved)
+        connection.send(b"setpoint")
+        assert moved.recv(64) == b"setpoint"
+        known(connection, thief)  # the new port is open, and keeps its place
+        connection.send(b"next")
+        assert moved.recv(64) == b"next"
+        assert connection.refused == {"second-address": 1}
+
+
+@pytest.mark.fault(39)
 def test_noise_does_not_keep_the_place_of_a_vehicle() -> None:
     """Who once passed for the vehicle, with a frame held back, and then says nothing genuine loses the setpoints."""
     clock = Clock()

@@ -113,8 +113,8 @@ def test_the_filter_is_that_of_the_flight() -> None:
         batch.update(k, positions_m[None, k], newest[:, k], inputs[:, :k])
         mean, cov = batch.now
         if belief is None:
-            drawn = kalman.drawn_cov.copy()
-            drawn[: kalman.n_x, : kalman.n_x] = cov[0]
+            drawn = np.pad(cov[0], (0, len(kalman.drawn_rows)))
+            drawn[kalman.n_x :] = kalman.drawn_rows
             belief = Belief(0, 0, np.pad(mean[0], (0, len(drawn) - kalman.n_x)), drawn, InertialTrust(used_ns=0))
             continue
         # Inertial data of a step belong to its end, before the next disturbance is drawn.

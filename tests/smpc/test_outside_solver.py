@@ -14,6 +14,7 @@ from uavctl.errors import EndedBySignal
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Path, Preview
 from uavctl.smpc.batch import Information
+from uavctl.smpc.braking import Braking
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.outside import OutsideSolver, PlanRequest, SilencePlanner, retarget
 
@@ -36,6 +37,25 @@ def paper() -> ControlProblem:
 
 def here(paper: ControlProblem) -> Array:
     return paper.target + np.linspace(0.5, 1.0, paper.plant.n_x)
+
+
+def test_a_request_says_how_fast_it_may_fly(paper: ControlProblem) -> None:
+    saying = Saying(lambda request: request.inputs)
+    solver, plant = OutsideSolver("ours", paper, saying), paper.plant
+    two = np.ones(len(plant.axes))
+    braking = Braking(-9.0 * two, 9.0 * two, accel_mps2=two, lag_s=0.5 * two, slew_mps3=np.inf, gain_1ps=1.0)
+    x, sent = here(paper), 0.3 * two
+    x[list(plant.position_index)], x[list(plant.velocity_index)] = 8.0, -0.5
+    solver.solve(0, x, paper.target, Preview(braking=braking, sent_mps2=sent))
+    solver.solve(1, x, paper.target)
+    limited, free = saying.asked
+    assert limited.braking is braking
+    # v T + v = 1 m to the upper limit; half a second, then v / g: 0.75 m along the way to the lower one
+    np.testing.assert_allclose(limited.velocity_limits[1], 1.0 / 1.5)
+    np.testing.assert_allclose(limited.stop_m, 0.75)
+    np.testing.assert_array_equal(free.velocity_limits, [-np.inf * two, np.inf * two])
+    for values in (limited.velocity_limits, limited.stop_m):
+        assert not values.flags.writeable
 
 
 def test_a_request_has_all_data_of_a_scheme_and_is_read_only(paper: ControlProblem) -> None:

@@ -22,6 +22,7 @@ from flight_rig import (
     small_plant,
     vehicle,
 )
+from msgspec import structs
 
 from uavctl.arrays import Array
 from uavctl.flight.controller import Controller
@@ -72,11 +73,11 @@ class WildSolver(StubSolver):
         if kind == 1:
             return Answer.failed(seq, SolveStatus.INFEASIBLE, "stub")
         if kind == 2:
-            return replace(answer, seq=seq - 1)
+            return structs.replace(answer, seq=seq - 1)
         inputs = -0.8 * x[[0, 3]] - 1.2 * x[[1, 4]] + self.rng.normal(scale=0.3, size=(HORIZON, 2))
         if kind == 3:
             inputs[int(self.rng.integers(HORIZON)), 0] = self.rng.choice(ODD)
-        return replace(answer, inputs=np.asarray(inputs))
+        return structs.replace(answer, inputs=np.asarray(inputs))
 
 
 @dataclass

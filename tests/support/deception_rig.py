@@ -342,12 +342,14 @@ def draw_flight(seed: int, plant: str = "quadrotor") -> tuple[Config, Config, Co
     return config, believed, controller, deceptions, blackout_s
 
 
-def draw_response_flight(seed: int) -> tuple[Config, Config, Controller, list[Deception], float | None]:
+def draw_response_flight(
+    seed: int, plant: str = "quadrotor"
+) -> tuple[Config, Config, Controller, list[Deception], float | None]:
     """Draw a flight between walls whose response is wrong from a moment on: no blackout."""
     rng = np.random.default_rng([seed, 40])
     autopilot, preset = _choose_autopilot(seed)
     waypoints = _draw_waypoints(rng, preset, autopilot)
     at_s = float(rng.uniform(2.5, 14.0))
-    config = _load_world(seed, rng, waypoints, at_s + AFTER_S)
+    config = _load_world(seed, rng, waypoints, at_s + AFTER_S, plant=plant)
     believed, controller = prepare_believed(preset, autopilot, (f"mission.waypoints=[{waypoints}]",))
     return config, believed, controller, [Deception("response", str(rng.choice(RESPONSES)), at_s)], None

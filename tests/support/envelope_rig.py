@@ -16,7 +16,7 @@ from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import engaged
 from uavctl.flight.monitors.braking import BrakingState
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
-from uavctl.flight.monitors.observation import EnvelopeParameters, Observation
+from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, read_vehicle_velocity
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.outside import OutsideState
 from uavctl.flight.monitors.vehicle_velocity import (
@@ -93,10 +93,17 @@ def update(
     return state, None if verdict.is_none else verdict
 
 
+def _observe_velocity(
+    state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
+) -> VelocityObservation:
+    own_mps = read_vehicle_velocity(tick.motion, tick.at_ns)
+    return VelocityObservation(state, tick.at_ns, own_mps, tick.velocity_mps, age_s, parameters)
+
+
 def trusted_velocity(
     state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
 ) -> Vec3 | None:
-    observation = VelocityObservation(state, tick, age_s, parameters)
+    observation = _observe_velocity(state, tick, age_s, parameters)
     velocity, verdict = find_trusted_velocity(observation), judge_vehicle_velocity(observation)
     assert verdict.is_none == (velocity is not None)
     assert verdict.is_none or verdict.action is Action.DISTRUST_VEHICLE_VELOCITY
@@ -106,7 +113,7 @@ def trusted_velocity(
 def is_prediction_inconsistent(
     state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
 ) -> bool:
-    verdict = judge_prediction(VelocityObservation(state, tick, age_s, parameters))
+    verdict = judge_prediction(_observe_velocity(state, tick, age_s, parameters))
     assert verdict.is_none or (verdict.action, verdict.cause) == (Action.BRAKE, EventCode.PREDICTION_INCONSISTENT)
     return not verdict.is_none
 
@@ -114,7 +121,7 @@ def is_prediction_inconsistent(
 def is_inertial_inconsistent(
     state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
 ) -> bool:
-    return not is_inertial_consistent(VelocityObservation(state, tick, age_s, parameters))
+    return not is_inertial_consistent(_observe_velocity(state, tick, age_s, parameters))
 
 
 def vec3(values: Sequence[float] | Array) -> Vec3:

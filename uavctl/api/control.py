@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -120,11 +120,10 @@ def get_limits(config: Config) -> tuple[list[tuple[float, float]], list[tuple[fl
     return states, list(zip(sets.input_lower, sets.input_upper, strict=True))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SolvedPlan(Answer):
+class SolvedPlan(Answer, frozen=True, eq=False, kw_only=True):
     """The answer of `solve`, with its configuration."""
 
-    config: Config = field(kw_only=True)
+    config: Config
 
     def __repr__(self) -> str:
         """Return a few lines: the status, and the first input with its units."""
@@ -161,7 +160,7 @@ def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> 
     n_x = design.plant.n_x
     target_state = design.target if target is None else make_state(target, n_x)
     answer = solver.solve(0, make_state(state, n_x), target_state)
-    return SolvedPlan(**{entry.name: getattr(answer, entry.name) for entry in fields(Answer)}, config=loaded)
+    return SolvedPlan(**msgspec.structs.asdict(answer), config=loaded)
 
 
 @lru_cache(maxsize=8)

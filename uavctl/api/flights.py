@@ -200,7 +200,7 @@ def fly(
     orders = FlightOrders(flight_config, take_off_m=take_off_m, goto=goto is not None)
     check_places(flight_config, design, take_off_m, orders.goal)
     prepared = prepare(flight_config, design)
-    with create_recording(None if out is None else Path(out), flight_config.name, flight_config.log.free_bytes) as path:
+    with create_recording(None if out is None else Path(out), flight_config.name, flight_config.log) as path:
         flight = LockstepFlight(prepared, path, command="uavctl.fly")
         orders.begin(flight.loop)
         landing_s = None if take_off_m is None else compute_stop_limit_s(flight_config, takes_off=True)

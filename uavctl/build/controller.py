@@ -28,6 +28,7 @@ from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.yaw import YawMode, YawParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conditioned.planner import (
@@ -395,6 +396,11 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
         outside=outside,
         late_steps=design.horizon if outside or isinstance(design, ConditionedDesign) else len(design.late),
         envelope=build_envelope(config, plant),
+        yaw=YawParameters(
+            mode=YawMode(config.mission.yaw),
+            angle_rad=math.radians(config.mission.yaw_deg or 0.0),
+            rate_rps=math.radians(config.mission.yaw_rate_dps),
+        ),
         estimator=build_estimator(config),
         input_bounds=(np.array(config.sets.input_lower), np.array(config.sets.input_upper)),
         fallback=FallbackParameters(

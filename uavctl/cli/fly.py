@@ -84,7 +84,8 @@ def fly(
 
     Ctrl-C and the end of --duration brake and hold. Then the vehicle's own landing is requested (`fallback.land`; else
     the pilot takes the vehicle). The program ends once that landing has begun; after --takeoff, or where it passes
-    positions on to the vehicle, once the vehicle is disarmed. A second Ctrl-C ends it at once, without landing.
+    positions on to the vehicle, once the vehicle is disarmed. A second Ctrl-C ends it at once; another process then
+    asks for the landing.
     With --arm --takeoff HEIGHT the vehicle on the ground is armed, climbs by itself, and is flown from there.
 
     Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot
@@ -144,7 +145,7 @@ def fly_daemon(
         lock_vehicle(config.daemon.vehicle) as vehicle_lock,
         open_listener(find_control_folder(control), make_daemon_name(config)) as listener,
         open_viewers(view_port) as viewers,
-        create_recording(out, config.name, config.log.free_bytes) as path,
+        create_recording(out, config.name, config.log) as path,
     ):
         with locate_design_errors(loaded):
             design = build_flight_design(config)
@@ -192,7 +193,7 @@ def fly_daemon(
                     run_services(loop, config, path, recorder.status, listener) as service_functions,
                     record_failure(loop),
                     limit_ticks() as tick_limit,
-                    guard_landing(loop, config, connections[VEHICLE], print_warning) as guard_functions,
+                    guard_landing(loop, config, connections[VEHICLE], path, print_warning) as guard_functions,
                 ):
                     is_stop_requested = run_daemon(
                         loop,

@@ -236,11 +236,12 @@ def wait_for_server(stopped: Callable[[], bool]) -> Callable[[str], bool]:
 def print_losses(status: RecorderStatus) -> None:
     """Print after a flight what the recording lacks, and why."""
     if status.failures or not status.ok:
+        missing = count_missing_records(status)
+        loss = f"the recording lacks {missing} records" if missing else "a write of the recording failed"
         print_message(
             label_text(
                 "warning",
-                f"the recording lacks {count_missing_records(status)} records "
-                f"({status.reason or status.refusal or 'the disk was too slow'}); what is in it is whole. "
+                f"{loss} ({status.reason or status.refusal or 'the disk was too slow'}); what is in it is whole. "
                 f"Files: {', '.join(status.segments) or 'none'}",
                 "bold red",
             )

@@ -128,7 +128,7 @@ def fly_simulated(
     with locate_design_errors(loaded):
         design = build_flight_design(config)
     orders = FlightOrders(config, take_off_m=take_off_m, goto=goto, follower=follower)
-    with open_viewers(view_port) as viewers, create_recording(out, config.name, config.log.free_bytes) as path:
+    with open_viewers(view_port) as viewers, create_recording(out, config.name, config.log) as path:
         with locate_design_errors(loaded):
             check_places(config, design, take_off_m, orders.goal)
             prepared = prepare(config, design)

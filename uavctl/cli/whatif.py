@@ -142,7 +142,7 @@ def whatif(
         noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
         other_link = SimulatedLink(history, other_link_config, before.sim.seed if seed is None else seed, noise_m)
     begin_s = time.perf_counter()
-    with create_recording(out, loaded.config.name, before.log.free_bytes) as path, _show_progress() as progress:
+    with create_recording(out, loaded.config.name, before.log) as path, _show_progress() as progress:
         reproduced = _reproduce(history, recorded_controller, response, _make_watch(progress, "reproducing the flight"))
         course, status = _record_changed(
             history,

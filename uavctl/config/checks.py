@@ -85,6 +85,7 @@ def check_mission(plant: PlantConfig, sets: SetsConfig, mission: MissionConfig) 
             '"land" has no end to come after: the target is held',
             "give waypoints or a trajectory; one waypoint with a hold_s will do",
         )
+    yield from _check_yaw(plant, mission)
     hold_times = mission.hold_s if isinstance(mission.hold_s, tuple) else (mission.hold_s,)
     if min(hold_times, default=0.0) < 0:
         yield ConfigProblem("mission.hold_s", "a time is negative", "give numbers >= 0")
@@ -92,6 +93,17 @@ def check_mission(plant: PlantConfig, sets: SetsConfig, mission: MissionConfig) 
         yield from find_outside(plant, sets, waypoint, f"mission.waypoints[{i}]", "waypoint")
     if has_trajectory:
         yield from _check_trajectory(plant, sets, trajectory)
+
+
+def _check_yaw(plant: PlantConfig, mission: MissionConfig) -> Iterator[ConfigProblem]:
+    if mission.yaw == "angle" and mission.yaw_deg is None:
+        yield ConfigProblem("mission.yaw", '"angle" has no angle', "give mission.yaw_deg")
+    if mission.yaw != "angle" and mission.yaw_deg is not None:
+        yield ConfigProblem(
+            "mission.yaw_deg", f'mission.yaw is "{mission.yaw}"', 'set mission.yaw = "angle", or remove it'
+        )
+    if mission.yaw == "path" and not {"north", "east"} <= set(plant.axes):
+        yield ConfigProblem("mission.yaw", "the plant does not move north and east", 'give "hold" or "angle"')
 
 
 def _check_trajectory(plant: PlantConfig, sets: SetsConfig, trajectory: TrajectoryConfig) -> Iterator[ConfigProblem]:

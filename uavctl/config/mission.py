@@ -81,6 +81,25 @@ class MissionConfig(Section, frozen=True, kw_only=True):
             "and hand over to the vehicle's own landing"
         ),
     ] = "hold"
+    yaw: Annotated[
+        Literal["hold", "path", "angle"],
+        Meta(
+            description="yaw setpoint: `hold` sends none (PX4 keeps its yaw, ArduPilot does as WP_YAW_BEHAVIOR says), "
+            "`path` follows the planned motion from 0.3 m/s on, `angle` turns to `yaw_deg`"
+        ),
+    ] = "hold"
+    yaw_deg: Annotated[
+        Annotated[float, Meta(ge=-180, le=180)] | None,
+        Meta(description="yaw of `angle`, clockwise from north as seen from above [deg]"),
+    ] = None
+    yaw_rate_dps: Annotated[
+        float,
+        Meta(
+            ge=1,
+            le=360,
+            description="largest turn of the yaw setpoint in a second; ArduPilot's own limit is 60 [deg/s]",
+        ),
+    ] = 60.0
     trajectory: TrajectoryConfig = TrajectoryConfig()
 
 

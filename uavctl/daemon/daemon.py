@@ -7,8 +7,8 @@ An error ends no flight without a landing request:
 2. In what gives the orders of the flight: the flight ends as if that were asked for.
 3. In a cycle: no setpoint any more; the next cycles ask for landing and pass positions on.
 4. In several cycles in a row: a landing request of its own is sent until it is answered.
-A tick that does not end is an error of its cycle (`uavctl.daemon.tick_limit`). If the process dies, another one asks
-for landing (`uavctl.daemon.landing_host`).
+A tick that does not end is an error of its cycle (`uavctl.daemon.tick_limit`), and so are ticks that come too rarely
+(`uavctl.daemon.tick_gaps`). If the process dies, another one asks for landing (`uavctl.daemon.landing_host`).
 """
 
 from __future__ import annotations
@@ -23,12 +23,14 @@ from msgspec.structs import replace
 from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
 from uavctl.clock import Ticker, monotonic_ns
+from uavctl.daemon.tick_gaps import GapLimit
 from uavctl.errors import ConnectionClosedError, TickOverdueError, UavctlError
 from uavctl.event_codes import EventCode
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import OVERRUN, VEHICLE
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Event, Outgoing, Ticked
 
 READ_PAUSE_NS = 2_000_000  # after a read without data for the flight
@@ -122,6 +124,7 @@ class _Flight:
         self._first_ns: int | None = None
         self._stop_ns: int | None = None
         self._is_over = False
+        self._gap_limit = GapLimit()
         self._withheld = 0  # messages to the vehicle in this cycle
         self._failed_cycles = 0  # in a row
         self._ticked: Ticked | None = None  # the last tick
@@ -189,6 +192,7 @@ class _Flight:
         if self._is_past_limit(due.at_ns):
             self._is_over = True
             return
+        self._gap_limit.check(due.at_ns, is_in_control=loop.handover_state is HandoverState.ENGAGED)
         self._withheld = 0
         with self.limit_tick():
             ticked = loop.tick(due.tick, due.at_ns, self._send, due.missed, stop=self._stop_ns is not None)

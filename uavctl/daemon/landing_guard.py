@@ -2,7 +2,8 @@
 
 1. The flight gives it the frames, the vehicle's address and the open connection, at once and then twice a second, as
    long as the vehicle would have to be landed if control failed. Each tick is a sign of life.
-2. If the flight's process dies, or gives no sign of life for long, `uavctl.daemon.landing_host` asks for landing.
+2. If the flight's process dies, gives no sign of life for long, or is ended at once by a second signal,
+   `uavctl.daemon.landing_host` asks for landing.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import msgspec
 
@@ -78,14 +80,18 @@ class LandingGuard:
             self._helper.socket.send(END)
         self._helper.close()
 
+    def leave(self) -> None:
+        """Leave the vehicle to the process, which finds that the flight has ended."""
+        self._helper.socket.close()
+
 
 @contextmanager
 def guard_landing(
-    loop: ControlLoop, config: Config, connection: Connection, report: Callable[[str], None]
+    loop: ControlLoop, config: Config, connection: Connection, recording: Path, report: Callable[[str], None]
 ) -> Iterator[Sequence[Callable[[Ticked, int], None]]]:
     """Yield the functions to call after each tick; none where the process cannot be started, which is reported."""
     hand_over = config.hand_over
-    arguments = (hand_over.answer_s, hand_over.land_s, config.daemon.system_id, config.daemon.component_id)
+    arguments = (hand_over.answer_s, hand_over.land_s, config.daemon.system_id, config.daemon.component_id, recording)
     try:
         helper = HelperProcess("uavctl.daemon.landing_host", [str(argument) for argument in arguments], stderr=None)
     except OSError as error:
@@ -95,5 +101,10 @@ def guard_landing(
     guard = LandingGuard(helper, loop, connection, round(hand_over.answer_s * SECOND_NS))
     try:
         yield (guard.after_tick,)
-    finally:
+    except SystemExit:  # the second signal of the operator: nothing here waits for the landing
+        guard.leave()
+        raise
+    except BaseException:
         guard.close()
+        raise
+    guard.close()

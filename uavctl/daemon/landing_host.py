@@ -3,6 +3,7 @@
 1. Take what a landing needs from FEED, the number of a socket; see `uavctl.daemon.landing_guard`.
 2. Kill the flight's process if it gives no sign of life for `SILENCE_S`: a process that does no tick hears no pilot.
 3. Once it has died, read what the vehicle says, and ask it to land until it has accepted, or does not fly for us.
+4. Say that it has ended, how that ended, and how to read its recording.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def main(arguments: list[str]) -> int:
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGPIPE, signal.SIGTSTP):
         signal.signal(ignored, signal.SIG_IGN)
     flight = os.getppid()
-    number, answer_s, land_s, system, component = arguments
+    number, answer_s, land_s, system, component, recording = arguments
     request = LandingRequest(
         (int(system), int(component)), HandOverConfig(answer_s=float(answer_s), land_s=float(land_s))
     )
@@ -117,9 +118,12 @@ def main(arguments: list[str]) -> int:
         if not feed.wait_for_death(flight):
             return 0
     if feed.landing.requests and feed.descriptor >= 0:
-        _tell("error: the flight's process has died in the air; landing is asked for")
+        _tell("error: the flight's process has ended in the air; landing is asked for")
         land(feed.landing, feed.descriptor, request)
         _tell("ended: the vehicle lands, or is not ours any more" if request.is_answered else "ended: no answer")
+    else:
+        _tell("error: the flight's process has ended; no landing is asked for")
+    _tell(f"recording: `uavctl log report {recording}` says how far it goes, and draws its page")
     return 0
 
 

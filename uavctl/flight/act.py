@@ -1,6 +1,7 @@
 """Phase 5 of a tick: pass the setpoint through the setpoint limiter, and note the input in the filter.
 
-1. A plan gives its input of this step. The fallback gives braking, the acceleration of HOLD, and the way back.
+1. A plan gives its input of this step, and the yaw along its motion where that is wanted (`uavctl.flight.yaw`). The
+   fallback gives braking, the acceleration of HOLD, and the way back.
 2. The setpoint limiter bounds and slew-limits it. After a breach of the envelope the vehicle is level at
    once: slewing would be flown on data that cannot be believed.
 3. The input acts in the filter from now on, or after the dead time. While the vehicle takes no setpoints others fly.
@@ -14,7 +15,7 @@ import msgspec
 import numpy as np
 
 from uavctl.arrays import Array
-from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
+from uavctl.flight.context import FilterView, TickContext, expand_axes, read_position, read_velocity
 from uavctl.flight.decide import Decided, carries_estimate, find_braking_velocity, find_hold_accel
 from uavctl.flight.estimator import FilterHistory, PendingInputs, drop_samples, note_input
 from uavctl.flight.fallback import Fallback, FallbackReason, compute_brake_accel, compute_return_accel
@@ -23,6 +24,7 @@ from uavctl.flight.limits import ZERO, limit_setpoint
 from uavctl.flight.measure import Measured
 from uavctl.flight.state import ControlState
 from uavctl.flight.supervise import Supervised
+from uavctl.flight.yaw import YawMode, compute_yaw
 from uavctl.records import ControlMode, Setpoint, SetpointSource, Vec3
 from uavctl.smpc.plant import Plant
 
@@ -70,21 +72,35 @@ def _make_setpoint(
         return None, None
     wanted = ZERO
     if fallback is not None:
-        wanted = _compute_fallback_accel(fallback, state, context, supervised, decided)
+        wanted = _compute_fallback_accel(fallback, context, supervised, decided)
     elif plan is not None:
         wanted = controller.plant.to_accel(np.array(plan.inputs[context.step - plan.seq]))
     is_level = fallback is not None and fallback.reason is FallbackReason.ENVELOPE
     before = ZERO if is_level else state.plan.sent_mps2
     accel, limited = limit_setpoint(wanted, before, controller.tick_ns * 1e-9, controller.limits)
-    setpoint = Setpoint(at_ns=context.at_ns, accel_mps2=accel, source=source, limited=limited)
+    yaw_rad = _compute_yaw(state, context, decided)
+    setpoint = Setpoint(at_ns=context.at_ns, accel_mps2=accel, yaw_rad=yaw_rad, source=source, limited=limited)
     return setpoint, controller.plant.to_input(accel)
 
 
-def _compute_fallback_accel(
-    fallback: Fallback, state: ControlState, context: TickContext, supervised: Supervised, decided: Decided
-) -> Vec3:
+def _compute_yaw(state: ControlState, context: TickContext, decided: Decided) -> float | None:
+    """Compute the yaw setpoint [rad]; none where yaw is held, or others fly the vehicle and turn it as they want."""
+    controller, plan = context.controller, decided.plan
+    if context.not_ready_reason or controller.yaw.mode is YawMode.HOLD:
+        return None
+    planned_mps = None
+    if plan is not None:
+        plant = controller.plant
+        planned_mps = expand_axes(plant, plan.states[context.step - plan.seq], plant.velocity_index, 0.0)
+    tick_s = controller.tick_ns * 1e-9
+    return compute_yaw(
+        state.plan.sent_yaw_rad, context.inputs.motion, planned_mps, context.at_ns, tick_s, controller.yaw
+    )
+
+
+def _compute_fallback_accel(fallback: Fallback, context: TickContext, supervised: Supervised, decided: Decided) -> Vec3:
     """Compute the acceleration that the fallback wants [m/s²]."""
-    moving, _ = find_braking_velocity(state, context, supervised)
+    moving, _ = find_braking_velocity(context, supervised)
     brake = compute_brake_accel(fallback, context.at_ns, moving, context.controller.fallback)
     hold = find_hold_accel(fallback, decided.biases, context, supervised)
     back = find_return_accel(fallback, decided.hold_point_m, supervised.view, context.controller.plant)

@@ -111,8 +111,8 @@ def observe_motion(
     """Put together what monitors compare."""
     position, velocity, plant = None, (math.nan, math.nan, math.nan), context.controller.plant
     if estimate is not None:
-        position = _expand_axes(plant, estimate.mean, plant.position_index, math.nan)
-        velocity = _expand_axes(plant, estimate.mean, plant.velocity_index, math.nan)
+        position = expand_axes(plant, estimate.mean, plant.position_index, math.nan)
+        velocity = expand_axes(plant, estimate.mean, plant.velocity_index, math.nan)
     return Observation(
         at_ns=context.at_ns,
         samples=accepted,
@@ -127,15 +127,15 @@ def observe_motion(
 
 def read_position(estimate: Estimate | None, plant: Plant, missing: float = 0.0) -> Vec3:
     """Return the predicted position, `missing` in the axes that the plant lacks."""
-    return ZERO if estimate is None else _expand_axes(plant, estimate.mean, plant.position_index, missing)
+    return ZERO if estimate is None else expand_axes(plant, estimate.mean, plant.position_index, missing)
 
 
 def read_velocity(estimate: Estimate | None, plant: Plant, missing: float = 0.0) -> Vec3:
     """Return the predicted velocity, `missing` in the axes that the plant lacks."""
-    return ZERO if estimate is None else _expand_axes(plant, estimate.mean, plant.velocity_index, missing)
+    return ZERO if estimate is None else expand_axes(plant, estimate.mean, plant.velocity_index, missing)
 
 
-def _expand_axes(plant: Plant, mean: Vector, index: Sequence[int], missing: float) -> Vec3:
+def expand_axes(plant: Plant, mean: Vector, index: Sequence[int], missing: float) -> Vec3:
     """Return entries of a state (n_x,) as north, east, down."""
     if plant.axes == AXES:
         first, second, third = index

@@ -11,9 +11,12 @@ from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.mission import Mission
+from uavctl.flight.monitors.external import make_braking
 from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.outliers import GateParameters, Reach, make_reach
+from uavctl.flight.yaw import HELD_YAW, YawParameters
 from uavctl.smpc.answer import Solver
+from uavctl.smpc.braking import Braking
 from uavctl.smpc.plant import Plant
 
 
@@ -43,10 +46,13 @@ class Controller:
     outside: str = ""  # name of the controller of another package that is the solver; empty: it is one of ours
     # Least and largest input (n_u,) that may be sent, bias included; None: those of the design
     input_bounds: tuple[Array, Array] | None = None
+    yaw: YawParameters = HELD_YAW  # parameters of the yaw setpoint
     envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: no monitor of motion runs
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others
     reach: Reach = field(init=False, repr=False)  # reachable set of the vehicle, made from the others
+    # Braking that a controller of another package must leave room for; None without an envelope
+    braking: Braking | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.tick_ns <= 0 or self.dt_ns % self.tick_ns:
@@ -54,6 +60,10 @@ class Controller:
         for waypoint in self.mission.waypoints:
             if waypoint.target.shape != (self.plant.n_x,):
                 raise ValueError(f"target has shape {waypoint.target.shape}, wanted ({self.plant.n_x},)")
+        braking = None
+        if self.envelope is not None:
+            braking = make_braking(self.envelope, self.limits, self.fallback, self.plant.axes)
+        object.__setattr__(self, "braking", braking)
         object.__setattr__(self, "ticks_per_step", self.dt_ns // self.tick_ns)
         object.__setattr__(self, "kalman", make_kalman(self.plant, self.estimator, self.dt_ns))
         ticks = self.horizon * self.ticks_per_step

@@ -32,15 +32,15 @@ from uavctl.flight.fallback import (
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
-from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
-from uavctl.flight.supervise import Supervised, are_inertial_lost, are_positions_lost, observe_velocity
+from uavctl.flight.supervise import Supervised, are_positions_lost, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
+from uavctl.smpc.plant import Plant
 
 MISSION_OVER = "the mission is over: landing"
 # Positions that come back after a silence correct the vehicle's own velocity in their first second. Then they are
@@ -51,7 +51,7 @@ COMPARED_NS = CORRECTS_NS + 400_000_000
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL_TEXTS = {
-    FallbackReason.SOURCE_FAILED: "no position came, and the vehicle's own velocity or inertial data failed",
+    FallbackReason.VELOCITY_WRONG: "no position came, and the vehicle's own velocity was found wrong",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
     FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
     FallbackReason.ENVELOPE: "what is seen cannot be",
@@ -115,8 +115,8 @@ def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
     fallback = ordered.fallback
     for reason in supervised.fallback_reasons:
         fallback = request_fallback(fallback, reason, at_ns)
-    if fallback is not None and _has_source_failed(phase):
-        fallback = request_fallback(fallback, FallbackReason.SOURCE_FAILED, at_ns)
+    if fallback is not None and _is_velocity_wrong(phase):
+        fallback = request_fallback(fallback, FallbackReason.VELOCITY_WRONG, at_ns)
     before, outliers = state.fallback.flown, state.estimator.sources.outliers
     is_final = fallback is not None and fallback.is_final
     becomes_final = is_final and not (before is not None and before.is_final)
@@ -290,7 +290,14 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
         input_bounds=_shift_input_bounds(base.bias, controller),
+        sent_mps2=_select_axes(phase.state.plan.sent_mps2, controller.plant),
+        braking=controller.braking if controller.outside else None,
     )
+
+
+def _select_axes(vector: Vec3, plant: Plant) -> Array:
+    """Return the entries (n_axes,) of a vector that the plant has."""
+    return np.array([vector[AXES.index(axis)] for axis in plant.axes])
 
 
 def _shift_input_bounds(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
@@ -365,7 +372,7 @@ def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Deci
 def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     """Advance the fallback to this tick."""
     state, context, view = phase.state, phase.context, phase.view
-    moving, measured = find_braking_velocity(state, context, phase.supervised)
+    moving, measured = find_braking_velocity(context, phase.supervised)
     is_predicted = not (measured or carries_estimate(fallback, view.belief))
     return advance_fallback(
         fallback,
@@ -380,11 +387,11 @@ def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     )
 
 
-def _has_source_failed(phase: _Phase) -> bool:
-    """Whether no position comes, and one of the vehicle's own sources was found wrong, or is lost."""
-    belief, at_ns = phase.view.belief, phase.context.at_ns
-    is_wrong = phase.supervised.monitors.engaged.velocity_change.has_found_wrong
-    return are_positions_lost(belief, at_ns) and (is_wrong or are_inertial_lost(belief, at_ns))
+def _is_velocity_wrong(phase: _Phase) -> bool:
+    """Whether no position comes, and the vehicle's own velocity was found wrong."""
+    supervised = phase.supervised
+    is_wrong = supervised.monitors.engaged.velocity_change.velocity_wrong_ns is not None
+    return is_wrong and are_positions_lost(supervised.view.belief, phase.context.at_ns)
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
@@ -412,16 +419,13 @@ def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, su
     return north, east, down
 
 
-def find_braking_velocity(state: ControlState, context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
+def find_braking_velocity(context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
     """Find the velocity to brake on, and whether it is the vehicle's own; else it is the predicted one."""
     estimate, plant = supervised.view.estimate, context.controller.plant
     predicted = read_velocity(estimate, plant)
-    observation = None
-    if context.inputs.motion is not None:
-        observation = observe_velocity(state, supervised.monitors.engaged, estimate, context)
-    is_believed = observation is not None and judge_vehicle_velocity(observation).is_none
-    own = read_vehicle_velocity(context.inputs.motion, context.at_ns) if is_believed else None
-    if own is None:
+    observation = observe_velocity(supervised.monitors.engaged, estimate, context)
+    if observation is None or observation.own_mps is None or not judge_vehicle_velocity(observation).is_none:
         return predicted, False
+    own = observation.own_mps
     north, east, down = (v if axis in plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))
     return (north, east, down), True

@@ -69,7 +69,7 @@ class FilterHistory(msgspec.Struct, frozen=True, eq=False):
     origin_ns: int  # A boundary of the Δt grid [ns]
     window_begin_ns: int  # everything up to here is in the anchor; older samples are refused [ns]
     anchor: FilterState  # state of the filter at the begin of the window
-    entries: tuple[FilterEvent, ...] = ()  # entries since then, sorted by key
+    entries: Sequence[FilterEvent] = ()  # entries since then, sorted by key
     states: list[FilterState] = []  # states of the filter after the first entries, as far as they are known
 
     @property
@@ -222,6 +222,19 @@ def drop_samples(history: FilterHistory, dropped: Callable[[PositionSample], boo
     )
 
 
+def weaken_samples(history: FilterHistory, std_m: float) -> FilterHistory:
+    """Let samples of the window count with this standard deviation [m] at least, as if they had come with it."""
+    return _keep_entries(
+        history,
+        [
+            entry
+            if entry.sample is None or entry.sample.std_m >= std_m
+            else replace(entry, sample=replace(entry.sample, std_m=std_m))
+            for entry in history.entries
+        ],
+    )
+
+
 def note_input(history: FilterHistory, at_ns: int, u: Array | None, belief: Belief | None = None) -> FilterHistory:
     """Note that an input acts from now on.
 
@@ -364,22 +377,23 @@ def _find_place(entries: Sequence[FilterEvent], key: Key) -> int:
 
 def _insert(history: FilterHistory, new: FilterEvent) -> FilterHistory:
     """Sort an entry in; the states from there on are not known any more."""
-    entries, place = history.entries, _find_place(history.entries, new.key)
+    entries, place = [*history.entries], _find_place(history.entries, new.key)
+    entries.insert(place, new)
     return FilterHistory(
         origin_ns=history.origin_ns,
         window_begin_ns=history.window_begin_ns,
         anchor=history.anchor,
-        entries=(*entries[:place], new, *entries[place:]),
+        entries=entries,
         states=history.states[:place],
     )
 
 
 def _keep_entries(history: FilterHistory, kept: Sequence[FilterEvent]) -> FilterHistory:
-    """Drop all other entries; the states from the first one dropped on are not known any more."""
+    """Keep these entries only; the states from the first change on are not known any more."""
     same = 0
     while same < len(kept) and kept[same] is history.entries[same]:
         same += 1
-    return replace(history, entries=tuple(kept), states=history.states[:same])
+    return replace(history, entries=kept, states=history.states[:same])
 
 
 def _apply_entry(

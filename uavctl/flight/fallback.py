@@ -6,7 +6,7 @@ A state machine of four modes, each with a time limit:
 
     reason                 from HOLD
     RECOVER                LAND after hold_s, or blind_hold_s, if configured; else it holds on
-    SOURCE_FAILED          LAND once its zero has been sent, if configured; else STOPPED
+    VELOCITY_WRONG         LAND once its zero has been sent, if configured; else STOPPED
     CONTROLLER_FAILED      the same
     POSITIONS_DISTRUSTED   the same
     ENVELOPE               the same; it does not brake before, as no position is believed: level at once
@@ -58,8 +58,8 @@ class FallbackReason(IntEnum):
     """Reason of the fallback, which decides its end. A greater one overrides a smaller one, for good."""
 
     RECOVER = auto()  # too few positions: plans fly again once they are back
-    # No position came, and one of the vehicle's own sources was wrong or lost: positions could not be checked.
-    SOURCE_FAILED = auto()
+    # No position came, and the vehicle's own velocity was found wrong: positions that come back could not be checked.
+    VELOCITY_WRONG = auto()
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
     ENVELOPE = auto()  # a monitor found the motion impossible: no plan again, and no braking
@@ -166,15 +166,6 @@ def compute_brake_accel(fallback: Fallback, at_ns: int, velocity_mps: Vec3, para
     # a = -g v
     north, east, down = (-parameters.brake_gain_1ps * v for v in velocity_mps)
     return north, east, down
-
-
-def compute_stop_m(speed_mps: float, most_mps2: float, parameters: FallbackParameters) -> float:
-    """Compute the distance that braking takes [m], with so much acceleration at most, and no lag."""
-    # v_g = a / g; s = v / g below it, else (v² - v_g²) / 2 a + v_g / g
-    gentle_mps = most_mps2 / parameters.brake_gain_1ps  # below this speed it brakes by less
-    if speed_mps <= gentle_mps:
-        return speed_mps / parameters.brake_gain_1ps
-    return (speed_mps**2 - gentle_mps**2) / (2.0 * most_mps2) + gentle_mps / parameters.brake_gain_1ps
 
 
 def compute_return_accel(off_m: Vec3, velocity_mps: Vec3) -> Vec3:

@@ -64,10 +64,9 @@ class Kalman:
 
     propagation: Propagation  # F and G of z = (x, w)
     w: Array  # covariance W (n_w, n_w)
-    # Covariance of z where w is drawn anew: W, and 0 between w and x (n_x + n_w, n_x + n_w)
-    drawn_cov: Array
-    drawn_cov_without_inertial: Array  # the same while the filter could use inertial data and has none
-    is_drawn: NDArray[np.bool_]  # which entries of a covariance of z these are (n_x + n_w, n_x + n_w)
+    # Rows of w in the covariance of z where w is drawn anew, [0, W] (n_w, n_x + n_w)
+    drawn_rows: Array
+    drawn_rows_without_inertial: Array  # the same while the filter could use inertial data and has none
     n_x: int  # number of states: the plant's, the biases, and what inertial data are off
     n_u: int  # number of inputs
     n_bias: int  # number of biases, behind the plant's states: n_u, or 0 where none is estimated
@@ -126,18 +125,14 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
     if n_inertial and n_bias:
         drift = slice(plant.n_w, plant.n_w + n_bias)
         w_without_inertial[drift, drift] *= DRIFT_WITHOUT_INERTIAL**2
-    n_x, n_z = model.n_x, model.n_x + model.n_w
-    is_drawn = np.ones((n_z, n_z), dtype=np.bool_)
-    is_drawn[:n_x, :n_x] = False
-    identity = np.eye(n_z)
+    identity = np.eye(model.n_x + model.n_w)
     measured_index = np.array(plant.position_index + plant.velocity_index, dtype=np.intp)
     return Kalman(
         propagation=make_propagation(model, dt_ns),
         w=model.w,
-        drawn_cov=np.pad(model.w, (n_x, 0)),
-        drawn_cov_without_inertial=np.pad(w_without_inertial, (n_x, 0)),
-        is_drawn=is_drawn,
-        n_x=n_x,
+        drawn_rows=np.pad(model.w, ((0, 0), (model.n_x, 0))),
+        drawn_rows_without_inertial=np.pad(w_without_inertial, ((0, 0), (model.n_x, 0))),
+        n_x=model.n_x,
         n_u=plant.n_u,
         n_bias=n_bias,
         n_inertial=n_inertial,
@@ -230,9 +225,10 @@ def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_
 
 def _draw_disturbance(kalman: Kalman, mean: Array, cov: Array, uses_inertial: bool) -> None:
     """Draw the disturbance anew, in place: w ~ N(0, W), independent of x."""
-    mean[kalman.n_x :] = 0.0
-    drawn = kalman.drawn_cov if uses_inertial else kalman.drawn_cov_without_inertial
-    np.copyto(cov, drawn, where=kalman.is_drawn)
+    n_x = kalman.n_x
+    mean[n_x:] = 0.0
+    cov[:n_x, n_x:] = 0.0
+    cov[n_x:] = kalman.drawn_rows if uses_inertial else kalman.drawn_rows_without_inertial
 
 
 def _uses_inertial(trust: InertialTrust, at_ns: int) -> bool:

@@ -86,9 +86,11 @@ def estimate_link(counts: LinkCounts, parameters: LinkEstimateParameters, at_ns:
     independent ones, by (1 - r) / (1 + r) with r the correlation of a step with the next (the variance of the mean
     of a two-state chain).
     """
-    statistic, correlation = compute_burst_statistic(counts), _compute_correlation(counts)
+    statistic, share = compute_burst_statistic(counts), 1.0
     bursts = statistic > parameters.burst_threshold
-    share = (1.0 - correlation) / (1.0 + correlation) if bursts else 1.0
+    if bursts:
+        correlation = _compute_correlation(counts)
+        share = (1.0 - correlation) / (1.0 + correlation)
     arrived, lost = share * counts.arrived, share * counts.lost
     return LinkEstimate(
         at_ns=at_ns,

@@ -38,6 +38,7 @@ from uavctl.flight.estimator import (
     move_window,
     predict_belief,
     update_inertial,
+    weaken_samples,
 )
 from uavctl.flight.kalman import (
     Belief,
@@ -194,9 +195,12 @@ def _gate_in_order(
             first = frozen.track_sample(sources.tracks, kalman, history, sample, np.zeros(len(kalman.axes)))
             sources = replace(sources, tracks=first)
         sources = replace(sources, jumps=jumps.note_position(sources.jumps, at_ns))
-        corrected = _correct_sample(sources, sample, at_ns)
+        corrected, knew_noise = _correct_sample(sources, sample, at_ns), sources.noise.is_known
         if belief is not None:  # else it is the first one, or too old
             sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, corrected, belief)
+            if not knew_noise and sources.noise.std_m > 0.0:
+                # The first positions have made a wrong velocity, and doubt of inertial data.
+                history, belief = weaken_samples(history, sources.noise.std_m), None
             if verdict.cause is not None:
                 code = verdict.cause.value
                 if verdict.since_ns is not None:
@@ -295,16 +299,14 @@ def _judge_sample(
     error_mps = np.zeros(n_axes) if sources.velocity_error_mps is None else sources.velocity_error_mps
     width = outliers.compute_gate(reach, kalman, belief, variances, error_mps)
     outlier_track, verdict = outliers.update(sources.outliers, OutlierObservation(at_ns, offset, width, n_axes))
+    if verdict.is_none or not sources.noise.is_known:
+        # The first positions may be so noisy that the others lie far from what they show.
+        sources = replace(sources, noise=noise.update(sources.noise, sample, at_ns))
     if verdict.is_none:
         later_error_mps = sources.velocity_error_mps
         if at_ns > (history.captured_ns or at_ns):
             later_error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
-        sources = replace(
-            sources,
-            velocity_error_mps=later_error_mps,
-            outliers=outlier_track,
-            noise=noise.update(sources.noise, sample, at_ns),
-        )
+        sources = replace(sources, velocity_error_mps=later_error_mps, outliers=outlier_track)
         if not sources.noise.is_known:
             return sources, NO_VERDICT
         return _judge_jump(kalman, sources, offset, _correct_sample(sources, sample, at_ns), belief)

@@ -80,6 +80,7 @@ class PlanGroup(msgspec.Struct, frozen=True, eq=False):
     superseded_after_ns: int | None = None
     decided_step: int | None = None  # step of the last tick
     sent_mps2: Vec3 = ZERO  # the last setpoint
+    sent_yaw_rad: float | None = None  # its yaw; None if it had none
 
 
 class FallbackGroup(msgspec.Struct, frozen=True, eq=False):

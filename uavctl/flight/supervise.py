@@ -223,19 +223,25 @@ def _has_drifted(state: ControlState, belief: Belief, view: FilterView, context:
     if then is not None:
         # A velocity of now needs no other estimate than the tick's.
         estimate = view.estimate if then is belief else make_estimate(controller.kalman, then, with_cov=False)
-    observation = observe_velocity(state, state.monitors.engaged, estimate, context)
+    observation = observe_velocity(state.monitors.engaged, estimate, context)
     return observation is not None and not vehicle_velocity.is_inertial_consistent(observation)
 
 
 def observe_velocity(
-    state: ControlState, monitors: MonitorState, estimate: Estimate | None, context: TickContext
+    monitors: MonitorState, estimate: Estimate | None, context: TickContext
 ) -> VelocityObservation | None:
     """Put together what the vehicle's own velocity is compared with; None where nothing is."""
     bounds = context.controller.envelope
     if bounds is None or estimate is None:
         return None
-    tick = observe_motion(estimate, context, state.plan.sent_mps2)
-    return VelocityObservation(monitors, tick, estimate.age_s, bounds)
+    return VelocityObservation(
+        monitors=monitors,
+        at_ns=context.at_ns,
+        own_mps=read_vehicle_velocity(context.inputs.motion, context.at_ns),
+        predicted_mps=read_velocity(estimate, context.controller.plant, math.nan),
+        age_s=estimate.age_s,
+        parameters=bounds,
+    )
 
 
 def _is_return_ordered(state: ControlState, view: FilterView, context: TickContext) -> bool:
@@ -284,7 +290,7 @@ def _update_engaged(
     )
     # A prediction that is so old, or that the vehicle's own velocity contradicts, is compared with no limit.
     is_old = view.age_steps is None or view.age_steps >= context.controller.horizon
-    if return_ordered or is_old or not _judge_prediction(state, before.engaged, view, context).is_none:
+    if return_ordered or is_old or not _judge_prediction(before.engaged, view, context).is_none:
         observation = replace(observation, position_m=None)
     monitors = before.engaged
     starts = monitors.motion.began_ns is None
@@ -293,11 +299,11 @@ def _update_engaged(
     return engaged.update(monitors, observation, bounds)
 
 
-def _judge_prediction(state: ControlState, monitors: MonitorState, view: FilterView, context: TickContext) -> Verdict:
+def _judge_prediction(monitors: MonitorState, view: FilterView, context: TickContext) -> Verdict:
     """Compare a prediction without recent positions with the vehicle's own velocity."""
     if (view.age_steps or 0) < PLAYED_OUT_STEPS:
         return NO_VERDICT
-    observation = observe_velocity(state, monitors, view.estimate, context)
+    observation = observe_velocity(monitors, view.estimate, context)
     return NO_VERDICT if observation is None else vehicle_velocity.judge_prediction(observation)
 
 
@@ -320,7 +326,7 @@ def _judge_plan(
     if context.controller.envelope is not None and _is_likely(sources.absurd):
         return _ABSURD_SO_FAR
     verdict = _judge_silence(monitors, view, context)
-    return _judge_prediction(state, monitors, view, context) if verdict.is_none else verdict
+    return _judge_prediction(monitors, view, context) if verdict.is_none else verdict
 
 
 def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContext) -> Verdict:
@@ -329,21 +335,14 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
         return NO_VERDICT
     if monitors.velocity_change.has_found_wrong:
         return _CONTRADICTED
-    is_carried = not are_positions_lost(view.belief, context.at_ns) or not are_inertial_lost(view.belief, context.at_ns)
-    return NO_VERDICT if is_carried else _CARRIED_BY_NOTHING
+    trust = view.belief.inertial
+    is_lost = trust.distrusted_ns is not None or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
+    return _CARRIED_BY_NOTHING if is_lost and are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
 
 
 def are_positions_lost(belief: Belief | None, at_ns: int) -> bool:
     """Whether no position has come for a while."""
     return belief is None or at_ns - belief.captured_ns > LOST_NS
-
-
-def are_inertial_lost(belief: Belief | None, at_ns: int) -> bool:
-    """Whether inertial data were used, and are distrusted now or have not come for a while."""
-    if belief is None:
-        return False
-    trust = belief.inertial
-    return trust.distrusted_ns is not None or at_ns - (trust.used_ns or at_ns) > LOST_NS
 
 
 def _is_likely(track: OutlierTrack | None) -> bool:

@@ -117,6 +117,7 @@ def _make_state(
             superseded_after_ns=decided.superseded_after_ns,
             decided_step=context.step,
             sent_mps2=ZERO if acted.setpoint is None else acted.setpoint.accel_mps2,
+            sent_yaw_rad=None if acted.setpoint is None else acted.setpoint.yaw_rad,
         ),
         fallback=FallbackGroup(
             flown=decided.fallback,

@@ -67,8 +67,8 @@ class _UdpConnection(SocketConnection):
 class UdpInConnection(_UdpConnection):
     """Bound UDP socket. It sends to the selected peer; before that, to the first sender of MAVLink.
 
-    Data of other senders is passed on too: cameras and vehicle may share a port. Another peer replaces only a silent
-    one, so nobody can take the setpoints of an active peer.
+    Data of other senders is passed on too: cameras and vehicle may share a port. Another peer replaces only one
+    that is silent or has closed its port, so nobody can take the setpoints of an active peer.
 
     Once known, vehicle and cameras get connected sockets of their own on the same port. The system separates their data
     from others, so a flood fills only the buffer of the common socket.
@@ -77,6 +77,7 @@ class UdpInConnection(_UdpConnection):
     def _bind_or_connect(self, address: Address) -> None:
         self._peer: Address | None = None
         self._is_peer_confirmed = False
+        self._has_peer_left = False  # its computer has answered since that nobody listens there
         self._heard_ns = 0
         self._peer_sockets: dict[Address, socket.socket] = {}
         self._trusted_ns: dict[Address, int] = {}
@@ -88,14 +89,18 @@ class UdpInConnection(_UdpConnection):
             self._socket.bind, address, "is another program on this port? end it, or take another port or address"
         )
 
+    @property
+    def _peer_socket(self) -> socket.socket | None:
+        """The peer's own socket, if there is one."""
+        return None if self._peer is None else self._peer_sockets.get(self._peer)
+
     def filenos(self) -> tuple[int, ...]:
         """See `Connection`."""
         return (self._socket.fileno(), *(sock.fileno() for sock in self._peer_sockets.values()))
 
     def count_lost(self) -> int:
         """See `Connection`."""
-        peer_socket = None if self._peer is None else self._peer_sockets.get(self._peer)
-        return _count_dropped(self._socket if peer_socket is None else peer_socket)
+        return _count_dropped(self._peer_socket or self._socket)
 
     def close(self) -> None:
         """See `Connection`."""
@@ -136,22 +141,25 @@ class UdpInConnection(_UdpConnection):
                 data, sender = sock.recvfrom(LARGEST)
             except BlockingIOError:
                 return True
-            except OSError:
+            except OSError as error:
                 self.receive_errors += 1
+                if isinstance(error, ConnectionRefusedError) and sock is self._peer_socket:
+                    self._has_peer_left = True
                 continue
             if self._admit_sender(data, sender) is not None:
                 arrived.append((data, self._now()))
         return False
 
     def select_peer(self, index: int) -> None:
-        """See `Connection`; another peer replaces the present one only after its silence."""
+        """See `Connection`; another peer replaces the present one only after its silence, or if its port is closed."""
         sender = self._senders[index]
         now_ns = self._now()
-        if self._is_peer_confirmed and sender != self._peer and now_ns - self._heard_ns <= PEER_SILENCE_NS:
+        is_peer_active = now_ns - self._heard_ns <= PEER_SILENCE_NS and not self._has_peer_left
+        if self._is_peer_confirmed and sender != self._peer and is_peer_active:
             self.refused[SECOND_ADDRESS] += 1
             return
         # Only messages of the vehicle itself keep its place; noise, forgeries and replays do not.
-        self._peer, self._is_peer_confirmed, self._heard_ns = sender, True, now_ns
+        self._peer, self._is_peer_confirmed, self._heard_ns, self._has_peer_left = sender, True, now_ns, False
         self._rate_limiter.set_vehicle(sender, now_ns)
         self._open_socket_for(sender, now_ns)
 
@@ -188,7 +196,7 @@ class UdpInConnection(_UdpConnection):
         """See `Connection`; the vehicle's own socket, which also receives its data, if there is one."""
         if self._peer is None:
             return -1, None
-        peer_socket = self._peer_sockets.get(self._peer)
+        peer_socket = self._peer_socket
         return (self._socket.fileno(), self._peer) if peer_socket is None else (peer_socket.fileno(), None)
 
     def send(self, data: bytes) -> None:

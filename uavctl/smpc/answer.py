@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Protocol
 
 import msgspec
@@ -12,12 +11,17 @@ import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.records import GaveWay, SolveStatus
+from uavctl.smpc.braking import Braking
 
 # Largest violation of a hard limit by a mean input that is clipped [input units]; with more it is no optimum.
 INPUT_TOLERANCE = 1e-6
 
 # Largest violation of a constraint that counts as kept, in its own unit or summed over a plan.
 KEPT_TOLERANCE = 1e-6
+
+
+class QuestionError(ValueError):
+    """A question that cannot be answered: its age or its covariance cannot be."""
 
 
 class Path(msgspec.Struct, frozen=True, eq=False):
@@ -43,6 +47,9 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
     # Smallest and largest inputs (n_u,), biases included, where the vehicle can do less than the design assumes;
     # None: it can do all of that
     input_bounds: tuple[Array, Array] | None = None
+
+    sent_mps2: Array | None = None  # acceleration setpoint that acts until then (n_axes,), without biases
+    braking: Braking | None = None  # braking of the fallback, for a controller that nothing keeps from the limits
 
     @property
     def nominal(self) -> bool:
@@ -70,8 +77,7 @@ def are_finite(arrays: Iterable[Array]) -> bool:
     return all(math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all()) for values in arrays)
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
+class Answer(msgspec.Struct, frozen=True, eq=False):
     """Optimal plan from one state, for the whole plant; one row a step Δt."""
 
     seq: int  # number of the question
@@ -163,8 +169,11 @@ class Solver(Protocol):
     """Interface of a solver of the decision problem."""
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
-        """Plan from state `x` (n_x,) to the equilibrium `target` (n_x,); never raises on numbers.
+        """Plan from state `x` (n_x,) to the equilibrium `target` (n_x,); numbers that are not finite get no plan.
 
         With an `preview.age` of j, `x` is the prediction for now from a position j steps old.
+
+        Raises:
+            QuestionError: The question cannot be answered.
         """
         ...

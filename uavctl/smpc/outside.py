@@ -23,6 +23,7 @@ from uavctl.errors import RAISED, EndedBySignal, in_words
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, are_finite
 from uavctl.smpc.batch import BatchController, Information
+from uavctl.smpc.braking import Braking
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.sets import find_equilibria
 
@@ -47,6 +48,9 @@ class PlanRequest:
     states: Array  # reference in stage t = 0 … H-1 (H, n_x): along a trajectory, or the target
     inputs: Array  # inputs that keep the reference without disturbances (H, n_u)
     limits: Array  # right sides of `ControlProblem.state_set` in stage t = 0 … H (H+1, m_x): fences close in
+    velocity_limits: Array  # least and greatest velocity (2, n_axes) now; beyond, the fallback lands the vehicle
+    stop_m: Array  # distance to a stop (n_axes,) from the estimated velocity, along it
+    braking: Braking  # where `velocity_limits` and `stop_m` come from, for the states to come
 
 
 class FlightPlanner(Protocol):
@@ -105,6 +109,10 @@ class OutsideSolver:
         if path is not None:
             states, inputs = states + path.states, inputs + path.inputs
         limits = np.tile(problem.state_set.b, (steps + 1, 1)) if preview.limits is None else preview.limits
+        plant = problem.plant
+        position, velocity = x[list(plant.position_index)], x[list(plant.velocity_index)]
+        braking = _make_unlimited_braking(len(plant.axes)) if preview.braking is None else preview.braking
+        sent_mps2 = np.zeros(len(plant.axes)) if preview.sent_mps2 is None else preview.sent_mps2
         return PlanRequest(
             step=seq,
             state=_read_only(x),
@@ -115,6 +123,9 @@ class OutsideSolver:
             states=_read_only(states),
             inputs=_read_only(inputs),
             limits=_read_only(limits),
+            velocity_limits=_read_only(braking.compute_velocity_limits(position, sent_mps2)),
+            stop_m=_read_only(braking.compute_stop_m(np.abs(velocity), np.sign(velocity) * sent_mps2)),
+            braking=braking,
         )
 
     def _answer(self, request: PlanRequest, planned: Array) -> Answer:
@@ -226,6 +237,12 @@ def _find_equilibrium_input(problem: ControlProblem) -> Callable[[Array], Array]
     plant = problem.plant
     rests = find_equilibria(plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp))
     return lambda target: np.asarray(rests.u_eq @ target[rests.held])
+
+
+def _make_unlimited_braking(axes: int) -> Braking:
+    """Make a braking without limits, where no monitor watches them."""
+    ones = np.ones(axes)
+    return Braking(-np.inf * ones, np.inf * ones, accel_mps2=ones, lag_s=0.0 * ones, slew_mps3=np.inf, gain_1ps=1.0)
 
 
 def _copy_controller(controller: BatchController) -> BatchController:

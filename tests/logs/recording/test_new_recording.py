@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -11,8 +12,10 @@ import pytest
 
 from logs.recording.ends import create_recording
 from uavctl.cli.app import run
+from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
 
+FULL, EMPTY = LogConfig(free_bytes=10**15), LogConfig(free_bytes=0)
 EXACT = ("--config", "paper", "--set", "solver.method=exact")
 
 
@@ -62,8 +65,24 @@ def test_a_height_that_is_outside_the_limits_leaves_no_folder(tmp_path: Path) ->
 
 
 def test_a_full_disk_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"log\.free_bytes"), create_recording(tmp_path / "a" / "b", "room", 2**62):
+    with pytest.raises(RecordingError, match=r"log\.free_bytes"), create_recording(tmp_path / "a", "room", FULL):
         pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.fault(29)
+def test_files_that_may_not_grow_enough_begin_no_recording(tmp_path: Path) -> None:
+    _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    log = LogConfig(segment_bytes=1_000_000, free_bytes=0)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard))
+        with pytest.raises(RecordingError, match=r"log\.segment_bytes"), create_recording(tmp_path / "a", "room", log):
+            pass
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, hard))
+        with create_recording(tmp_path / "a", "room", log) as path:
+            assert path.parent == tmp_path / "a"
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -75,14 +94,14 @@ def test_a_folder_that_was_there_stays(taken_port: int, tmp_path: Path) -> None:
 
 
 def test_a_recording_that_was_begun_stays(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), create_recording(tmp_path / "a" / "b", "room", 0) as path:
+    with pytest.raises(KeyboardInterrupt), create_recording(tmp_path / "a" / "b", "room", EMPTY) as path:
         path.write_bytes(b"the first records")
         raise KeyboardInterrupt
     assert path.read_bytes() == b"the first records"
 
 
 def test_of_nested_folders_only_those_made_and_empty_go(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), create_recording(tmp_path / "a" / "b", "room", 0):
+    with pytest.raises(KeyboardInterrupt), create_recording(tmp_path / "a" / "b", "room", EMPTY):
         (tmp_path / "a" / "another").mkdir()
         raise KeyboardInterrupt
     assert [one.name for one in (tmp_path / "a").iterdir()] == ["another"]

@@ -12,7 +12,7 @@ from view_rig import fly_view
 import logs.recording.recorder as recorder_module
 from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, OutputFile
-from logs.recording.file_scan import RecordedMessage, scan_file
+from logs.recording.file_scan import EndOfFile, RecordedMessage, scan_file
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import (
@@ -244,6 +244,35 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
         assert len(find_segments(path)) <= 1 + status.failures
         number += 1
     assert number > 20
+
+
+@pytest.mark.fault(87)
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("has_ticks", [True, False])
+def test_a_thread_that_dies_costs_no_record(has_ticks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, items, dead = tmp_path / "flight.mcap", flight(200), threading.Event()
+    plain = WriteQueue.drain
+
+    def drain(queue: WriteQueue, records: int, views: int) -> None:
+        if not dead.is_set():
+            dead.set()
+            raise SystemExit
+        plain(queue, records, views)
+
+    monkeypatch.setattr(WriteQueue, "drain", drain)
+    recorder = Recorder(path)
+    threads = [thread for thread in threading.enumerate() if thread.name == "recorder"]
+    assert dead.wait(10.0)
+    for thread in threads:
+        thread.join(10.0)
+    for item in items:
+        recorder.put(*item)
+        if has_ticks:
+            recorder.catch_up()
+    status = recorder.close()
+    assert status.ok and status.waiting == 0
+    assert drop_recorder_notes(list(read(path))) == round_records(items)
+    assert [one.finished for one in scan_file(path) if isinstance(one, EndOfFile)] == [True]
 
 
 def test_a_large_backlog_is_written_in_shares() -> None:

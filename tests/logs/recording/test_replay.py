@@ -12,7 +12,9 @@ from places import DATA
 
 from logs.recording.replay import replay
 from logs.recording.tlog import read_tlog, replay_tlog
-from logs.recording.topics import encode, parse_raw_topic
+from logs.recording.topics import ENDED, encode, parse_raw_topic
+from uavctl.account import make_ending
+from uavctl.cause import Cause
 from uavctl.config import load_config
 from uavctl.errors import RecordingError
 from uavctl.mavlink.connection import VEHICLE
@@ -109,6 +111,15 @@ def test_a_torn_recording_may_lack_the_end_of_its_last_tick_only(flown: MemorySi
     build = partial(make_loop, load_config("paper"))
     assert replay(torn, build, finished=False).identical
     assert not replay(torn, build).identical
+
+
+@pytest.mark.fault(86)
+def test_a_flight_that_a_second_signal_has_ended_may_lack_the_end_of_its_last_tick(flown: MemorySink) -> None:
+    last = max(i for i, (_, _, r) in enumerate(flown.entries) if isinstance(r, StepInput))
+    at_ns = flown.entries[last][1]
+    for cause in (Cause.SIGNALLED, Cause.ENDED_BY_OPERATOR):
+        ended = [*flown.entries[: last + 1], (ENDED, at_ns, make_ending(cause, "ended"))]
+        assert replay(ended, partial(make_loop, load_config("paper"))).identical == (cause is Cause.SIGNALLED)
 
 
 def test_a_recording_without_a_decision_is_not_identical(flown: MemorySink) -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import struct
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from recording_fakes import record_flight, stored_chunks
 
 from logs.recording.disk import DiskFile, check_free_space, find_later_segments, make_segment_path
+from logs.recording.file_scan import Damage, EndOfFile, RecordedMessage, scan_file
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.topics import get_definition
 from uavctl.errors import RecordingError
@@ -108,6 +111,51 @@ def test_empty_segment_is_a_valid_file(tmp_path: Path) -> None:
     Segment(DiskFile(path), 1024).finish()
     with path.open("rb") as file:
         assert list(make_reader(file, validate_crcs=True).iter_messages()) == []
+
+
+class LimitedFile(DiskFile):
+    """A file that may not grow beyond a size."""
+
+    limit = 10**9
+    size = 0
+
+    def write(self, data: bytes) -> None:
+        room = self.limit - self.size
+        self.size += min(room, len(data))
+        super().write(data[:room])
+        if room < len(data):
+            raise OSError(errno.EFBIG, "File too large")
+
+    def truncate(self, size: int) -> None:
+        super().truncate(size)
+        self.size = size
+
+
+@pytest.mark.fault(29)
+@pytest.mark.parametrize("room", [60, 49, 0])
+def test_a_file_without_room_for_its_index_is_closed_if_a_few_bytes_fit(room: int, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    file = LimitedFile(path)
+    segment = Segment(file, 1024)
+    messages = [QueuedMessage(get_definition("/raw/vehicle/in"), number, number, bytes(99)) for number in range(1, 9)]
+    for message in messages[:5]:
+        segment.add(message)
+    segment.commit()
+    file.limit = segment.bytes + room
+    for message in messages[5:]:
+        segment.add(message)
+    with pytest.raises(OSError, match="too large"):
+        segment.finish()
+    is_closed = room >= 50
+    with nullcontext() if is_closed else pytest.raises(OSError, match="too large"):
+        segment.abandon()
+    items = list(scan_file(path))
+    assert [item.sequence for item in items if isinstance(item, RecordedMessage)] == [1, 2, 3, 4, 5]
+    assert [item.finished for item in items if isinstance(item, EndOfFile)] == [is_closed]
+    assert not any(isinstance(item, Damage) for item in items)  # whole chunks only
+    if is_closed:
+        with path.open("rb") as opened:
+            assert len(list(NonSeekingReader(opened, validate_crcs=True).iter_messages())) == 5
 
 
 def test_never_overwrites(tmp_path: Path) -> None:

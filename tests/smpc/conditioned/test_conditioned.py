@@ -15,7 +15,7 @@ from scipy.stats import binomtest, norm
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
+from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview, QuestionError
 from uavctl.smpc.baselines import PacketisedPredictive
 from uavctl.smpc.batch import BatchSmpc
 from uavctl.smpc.conditioned.backoffs import RARE_SHARE, allocate_by_age, allocate_equally
@@ -320,6 +320,41 @@ def test_numbers_that_are_not_finite_get_no_plan() -> None:
     for x, preview in ((PAPER_START * np.nan, NOMINAL), (PAPER_START, Preview(cov=np.full((4, 4), np.nan)))):
         answer = solver.solve(4, x, case.target, preview)
         assert (answer.seq, answer.status) == (4, SolveStatus.FAILED)
+
+
+@pytest.mark.parametrize("age", [-48, -1, 48, 49])
+def test_an_age_without_a_budget_is_refused(age: int) -> None:
+    case = replace(problem("paper"), horizon=48)
+    solver = ConditionedSolver(case, LINK, ALLOWED)
+    with pytest.raises(QuestionError, match=f"a position {age} steps old"):
+        solver.solve(0, PAPER_START, case.target, Preview(age=age))
+    for kept in (0, 47):
+        assert solver.solve(0, PAPER_START, case.target, Preview(age=kept)).status is SolveStatus.OPTIMAL
+
+
+@pytest.mark.parametrize("scale", [1e300, 1e40, 1e20, -1.0, -1e-6])
+def test_a_covariance_that_cannot_be_is_refused(scale: float) -> None:
+    case, near = problem("paper"), np.array([0.0, 0.0, 40.0, 0.0])
+    solver, cov = ConditionedSolver(case, LINK, ALLOWED), np.diag([0.1, 0.01, 0.1, 0.01])
+    with pytest.raises(QuestionError, match="covariance"):
+        solver.solve(0, PAPER_START, near, Preview(cov=scale * cov))
+    mixed = cov.copy()
+    mixed[2, 3] = mixed[3, 2] = -abs(scale)  # each entry of the diagonal could be
+    if abs(scale) >= 1.0:
+        with pytest.raises(QuestionError, match="covariance"):
+            solver.solve(0, PAPER_START, near, Preview(cov=mixed))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e4, 1e8])
+def test_a_covariance_of_any_size_that_is_answered_keeps_its_back_offs(scale: float) -> None:
+    case, near = problem("paper"), np.array([0.0, 0.0, 40.0, 0.0])
+    answer = ConditionedSolver(case, LINK, ALLOWED).solve(
+        0, PAPER_START, near, Preview(cov=scale * np.diag([0.1, 0.01, 0.1, 0.01]))
+    )
+    assert answer.status is SolveStatus.OPTIMAL
+    excess = answer.states[1:] @ case.state_set.c.T + answer.backoff_x[1:] - case.state_set.b
+    gave_way = {(item.stage, item.index) for item in answer.relaxed}
+    assert {(t + 1, i) for t, i in zip(*np.nonzero(excess > 1e-6), strict=True)} <= gave_way
 
 
 def test_the_same_question_gives_the_same_bits_after_any_other_questions() -> None:

@@ -146,7 +146,8 @@ def test_plans_on_time_have_the_same_bits_with_late_designs() -> None:
     assert item.cost == other.cost
     np.testing.assert_array_equal(item.inputs, other.inputs)
     np.testing.assert_array_equal(item.backoff_x, other.backoff_x)
-    assert solver.solve(0, x, target, Preview(age=3)).status is SolveStatus.FAILED
+    for age in (3, -1, -2):
+        assert solver.solve(0, x, target, Preview(age=age)).status is SolveStatus.FAILED
 
 
 @pytest.mark.slow

@@ -250,9 +250,10 @@ def test_numbers_that_are_not_finite_give_no_plan(name: str, bad: float) -> None
         assert answer.inputs.size == 0
 
 
-def test_a_position_later_than_the_design_knows_fails() -> None:
+@pytest.mark.parametrize("age", [1, -1])
+def test_an_age_that_the_design_does_not_know_fails(age: int) -> None:
     tested = case("paper")
-    answer = tested.solver.solve(0, tested.design.target, tested.design.target, Preview(age=1))
+    answer = tested.solver.solve(0, tested.design.target, tested.design.target, Preview(age=age))
     assert (answer.status, answer.inputs.size) == (SolveStatus.FAILED, 0)
 
 

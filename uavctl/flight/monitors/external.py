@@ -4,21 +4,26 @@
 2. Braking now would end beyond a limit by more than half of the margin. Then: end the plans, in place of the next one.
 
 Nothing says that such a controller keeps the limits. It may come to a stop half as far beyond them as the monitor
-`uavctl.flight.monitors.outside` allows, which would not brake before it ends the plans.
+`uavctl.flight.monitors.outside` allows, which would not brake before it ends the plans. Each request tells it the
+velocities that this allows (`uavctl.smpc.outside.PlanRequest`).
 
 False alarms: none is known; who flies measures the time, and a replay takes it from the recording.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import msgspec
+import numpy as np
 
 from uavctl.event_codes import EventCode
-from uavctl.flight.fallback import FallbackParameters, compute_stop_m
+from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.limits import AXES, LimitsParameters
 from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vec3
+from uavctl.smpc.braking import Braking
 
 MAX_OVERDUE_ANSWERS = 3  # plans that took longer than a tick: one may be the computer's fault
 MAX_ANSWER_NS = 500_000_000  # half of the time after which a PX4 takes setpoints for gone
@@ -66,33 +71,39 @@ def update(state: ExternalState, observation: AnswerObservation) -> tuple[Extern
     return ExternalState(late, fault), end_plans(EventCode.CONTROLLER_LATE, fault)
 
 
+def make_braking(
+    parameters: EnvelopeParameters, limits: LimitsParameters, fallback: FallbackParameters, axes: Collection[str] = AXES
+) -> Braking:
+    """Make the braking that `judge_wall` counts on, for some axes."""
+    index = [AXES.index(axis) for axis in axes]
+    margin_m = MARGIN_PART * np.array(parameters.outside_m)[index]
+    return Braking(
+        lower_m=np.array(parameters.lower_m)[index] - margin_m,
+        upper_m=np.array(parameters.upper_m)[index] + margin_m,
+        accel_mps2=np.array(limits.accel_mps2)[index],
+        lag_s=np.array(parameters.lag_s)[index],
+        slew_mps3=limits.slew_mps3,
+        gain_1ps=fallback.brake_gain_1ps,
+    )
+
+
 def judge_wall(observation: WallObservation) -> Verdict:
     """Judge whether braking now would end too far beyond a limit."""
-    bounds, slew = observation.parameters, observation.limits.slew_mps3
-    rows = zip(
-        AXES,
-        observation.position_m,
-        observation.velocity_mps,
-        bounds.lower_m,
-        bounds.upper_m,
-        bounds.outside_m,
-        bounds.lag_s,
-        observation.sent_mps2,
-        observation.limits.accel_mps2,
-        strict=True,
-    )
-    for axis, position, velocity, lower, upper, margin, lag_s, sent, most in rows:
-        for out_m, outward, gains in ((lower - position, -velocity, -sent), (position - upper, velocity, sent)):
-            # The setpoint limiter takes time to ask for the opposite: v = v_0 + a² / 2 j, T = τ + (a + ½ a_max) / j
-            gains = max(gains, 0.0)
-            fastest = outward + gains * gains / (2.0 * slew)
-            turn_s = lag_s + (gains + 0.5 * most) / slew
-            # s = s_0 + v T + s_brake(v)
-            beyond_m = out_m + fastest * turn_s + compute_stop_m(fastest, most, observation.fallback)
-            if outward > 0.0 and beyond_m > MARGIN_PART * margin:
+    bounds = observation.parameters
+    braking = make_braking(bounds, observation.limits, observation.fallback)
+    position, velocity, sent = map(np.array, (observation.position_m, observation.velocity_mps, observation.sent_mps2))
+    margin_m = MARGIN_PART * np.array(bounds.outside_m)
+    for outward, gains, room_m in (
+        (-velocity, -sent, position - braking.lower_m),
+        (velocity, sent, braking.upper_m - position),
+    ):
+        # s - r > 0; NaN is an axis that the plant lacks
+        over_m = braking.compute_stop_m(np.maximum(outward, 0.0), gains) - room_m
+        for axis, speed, over, margin in zip(AXES, outward, over_m, margin_m, strict=True):
+            if speed > 0.0 and over > 0.0:
                 text = (
-                    f"the controller {observation.name} flies at the limit of {axis}: braking from {outward:.1f} m/s "
-                    f"would end {beyond_m:.1f} m beyond it"
+                    f"the controller {observation.name} flies at the limit of {axis}: braking from {speed:.1f} m/s "
+                    f"would end {over + margin:.1f} m beyond it"
                 )
                 return end_plans(EventCode.CONTROLLER_WALL, text)
     return NO_VERDICT

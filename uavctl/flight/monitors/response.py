@@ -91,7 +91,9 @@ class _Group:
         self.kinds = ("too late", *wrong, *rare)
         self.right = len(right)
         self.offsets = [0.0] * (len(rows) - len(rare)) + [RARE] * len(rare)
-        self.responses = np.array([np.hstack(row) for row in rows])  # (k, d, 3 d)
+        # What each leaves is e = L s of s = (a, u, u_late, u_too_late): L (k, d, 4 d), and L'L (k, 16 d²)
+        self.left = np.array([np.hstack([one, *(-r for r in row)]) for row in rows])
+        self.squares = (self.left.transpose(0, 2, 1) @ self.left).reshape(len(rows), -1)
 
 
 _HORIZONTAL = _Group(
@@ -276,16 +278,18 @@ def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_
     weights = samples[:, 0] * np.exp(at_ns * (1e-9 / MEMORY_S))
     count = float(weights.sum())
     weights = weights / count
-    # e = a - R u: (k, n, d)
-    left = accel - np.hstack([now, *delayed]) @ group.responses.transpose(0, 2, 1)
-    mean, mean_mps = weights @ left, weights @ velocity
-    left, velocity = left - mean[:, None], velocity - mean_mps
-    # var e, cov(e, v), var v
-    variance, covariance = (((left * other).sum(axis=2) @ weights).tolist() for other in (left, velocity))
-    variance_v = float((velocity * velocity).sum(axis=1) @ weights)
+    # s = (a, u, u late, u too late), and v behind: s̄ = Σ w s, C = Σ w (s - s̄)(s - s̄)'
+    shown, n_s = np.hstack([accel, now, *delayed, velocity]), group.left.shape[2]
+    mean_shown = weights @ shown
+    centred = shown - mean_shown
+    cov = (weights * centred.T) @ centred
+    # e = L s: var e = tr L C_ss L', cov(e, v) = tr L C_sv, var v = tr C_vv
+    variance = (group.squares @ cov[:n_s, :n_s].ravel()).tolist()
+    covariance = (group.left.reshape(len(group.left), -1) @ cov[n_s:, :n_s].ravel()).tolist()
+    variance_v = float(cov[n_s:, n_s:].trace())
     before = [total / state.baseline[0] for total in state.baseline]
-    jump = mean - [before[1 + axis] for axis in axes]
-    change_mps = mean_mps - [before[4 + axis] for axis in axes]
+    jump = group.left @ mean_shown[:n_s] - [before[1 + axis] for axis in axes]
+    change_mps = mean_shown[n_s:] - [before[4 + axis] for axis in axes]
     squared, along = (jump * jump).sum(axis=1).tolist(), (jump @ change_mps).tolist()
     squared_v = float(change_mps @ change_mps)
     # V = var e + 2 c cov(e, v) + c² var v; J = |Δē + c Δv̄|²; each with the best c
@@ -298,7 +302,7 @@ def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_
             noise_mps2,
             jump_mps2,
         )
-        for k in range(len(group.responses))
+        for k in range(len(group.left))
     ]
 
 

@@ -21,7 +21,7 @@ import msgspec
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.engaged import MonitorState
 from uavctl.flight.monitors.motion import bound_gusts_mps
-from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, read_vehicle_velocity
+from uavctl.flight.monitors.observation import EnvelopeParameters, read_vehicle_velocity
 from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict, brake
 from uavctl.records import Vec3, VehicleMotion
 
@@ -34,7 +34,9 @@ class VelocityObservation(msgspec.Struct, frozen=True, eq=False):
     """The vehicle's own velocity, and what it is compared with."""
 
     monitors: MonitorState
-    tick: Observation  # with the velocity that is predicted, or that inertial data have carried on
+    at_ns: int  # the tick [ns]
+    own_mps: Vec3 | None  # the vehicle's own velocity; None where it does not come
+    predicted_mps: Vec3  # that is predicted, or that inertial data have carried on; NaN in axes that the plant lacks
     age_s: float  # age of the newest position in that [s]: gusts may have changed it since
     parameters: EnvelopeParameters
 
@@ -50,22 +52,21 @@ def find_trusted_velocity(observation: VelocityObservation) -> Vec3 | None:
     Inertial data that change as it does support it, positions that agreed with it, the predicted velocity, and what was
     sent since a flight began.
     """
-    monitors, tick, parameters = observation.monitors, observation.tick, observation.parameters
-    velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
+    monitors, velocity, parameters = observation.monitors, observation.own_mps, observation.parameters
     if velocity is None or monitors.velocity_change.velocity_wrong_ns is not None:
         return None
-    if monitors.velocity_change.supports_velocity(tick.at_ns):
+    if monitors.velocity_change.supports_velocity(observation.at_ns):
         return velocity
     if monitors.velocity.is_contradicted:
         return None
     # |v - v_predicted| ≤ v_max + gusts(age)
     within_mps = parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
-    if monitors.velocity.apart_mps is not None or _is_near(velocity, tick.velocity_mps, within_mps):
+    if monitors.velocity.apart_mps is not None or _is_near(velocity, observation.predicted_mps, within_mps):
         return velocity
     motion = monitors.motion
     if motion.began_ns is None:
         return None
-    since_s = (tick.at_ns - motion.began_ns) * 1e-9
+    since_s = (observation.at_ns - motion.began_ns) * 1e-9
     # |v - v_sent| ≤ σ_begin + v_max + gusts(flight)
     within_mps = parameters.begins_mps + parameters.disagreement_mps + bound_gusts_mps(since_s, parameters)
     return velocity if since_s <= MODEL_COUNTS_S and _is_near(velocity, motion.model_mps, within_mps) else None
@@ -75,7 +76,7 @@ def judge_prediction(observation: VelocityObservation) -> Verdict:
     """Judge a prediction without fresh positions by the vehicle's own velocity."""
     velocity, parameters = find_trusted_velocity(observation), observation.parameters
     within_mps = MISLEADS * parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
-    if velocity is None or _is_near(velocity, observation.tick.velocity_mps, within_mps):
+    if velocity is None or _is_near(velocity, observation.predicted_mps, within_mps):
         return NO_VERDICT
     return brake(
         EventCode.PREDICTION_INCONSISTENT, "the vehicle moves otherwise than was predicted, and no position says why"
@@ -86,7 +87,7 @@ def is_inertial_consistent(observation: VelocityObservation) -> bool:
     """Whether a velocity that inertial data have carried on is near the vehicle's own, as far as that is believed."""
     velocity = find_trusted_velocity(observation)
     within_mps = observation.parameters.disagreement_mps
-    return velocity is None or _is_near(velocity, observation.tick.velocity_mps, within_mps)
+    return velocity is None or _is_near(velocity, observation.predicted_mps, within_mps)
 
 
 def find_confirmed_velocity(monitors: MonitorState, motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:

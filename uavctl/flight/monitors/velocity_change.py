@@ -86,8 +86,6 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     kept = state.samples[bisect_left(state.samples, own_ns - WINDOW_NS, key=_TIME) :]
     sample = (own_ns, own, tuple(gained), motion.model_mps)
     state = replace(state, samples=(*kept, sample))
-    if state.inertial_wrong_ns is not None:
-        return state
     unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
     return _compare(state, kept[0] if kept else sample, sample, unexplained, tick.at_ns, parameters)
 
@@ -107,9 +105,8 @@ def _compare(
     """
     s = (last[0] - first[0]) * 1e-9
     own, gained, model = [_subtract(now, then) for now, then in zip(last[1:], first[1:], strict=True)]
-    knows_wrong = state.velocity_wrong_ns is not None
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t
-    if not knows_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
+    if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
         return replace(state, agreed_ns=at_ns, disagrees_ns=None)
     disagrees_ns = at_ns if state.disagrees_ns is None else state.disagrees_ns
     if at_ns - disagrees_ns < PERSISTS_NS:
@@ -119,7 +116,10 @@ def _compare(
     own_mps, gained_mps = (min(math.dist(shown, model), math.dist(shown, pushed)) for shown in (own, gained))
     # v_max + gusts(t)
     explained_mps = 2.0 * (parameters.disagreement_mps + bound_gusts_mps(s, parameters))
-    if knows_wrong:
+    if state.inertial_wrong_ns is not None:
+        is_wrong = state.velocity_wrong_ns is None and own_mps > explained_mps
+        return replace(state, velocity_wrong_ns=at_ns) if is_wrong else state
+    if state.velocity_wrong_ns is not None:
         return replace(state, inertial_wrong_ns=at_ns if gained_mps > explained_mps else None)
     are_both_wrong = min(own_mps, gained_mps) > explained_mps
     return replace(

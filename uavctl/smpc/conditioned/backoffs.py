@@ -32,6 +32,7 @@ from scipy.special import ndtr, ndtri
 
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
+from uavctl.smpc.answer import QuestionError
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, Part, propagate_covariance
@@ -41,6 +42,8 @@ from uavctl.smpc.sets import find_pairs
 AGE_EXPONENT = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
 MAX_RISK = 0.5  # largest risk of a row: with more, the mean would be outside of its limit
 MIN_RISK = 1e-9  # least remainder of the allowed risk, as a share of it: a smaller one is rounding
+MAX_VARIANCE = 1e12  # largest variance along a row: a program takes a back-off of 1e30 for no limit
+ROUNDING = 1e-9  # largest rounding of a variance, as a share of the largest entry of its covariance
 RARE_SHARE = 0.05  # share of the allowed risk that the oldest ages, without back-offs, may use in transit
 
 
@@ -245,13 +248,19 @@ class RowDeviations:
         """Compute σ (H, m) from the covariance of the estimate's error, biases included (n, n); None: it is exact.
 
         Raises:
-            ValueError: It is of another size.
+            QuestionError: It is of another size, negative along a row, or too large for a program.
         """
         variance = self._constant
         if cov is not None:
             if cov.size != self._squares:
-                raise ValueError(f"a covariance of shape {cov.shape}, wanted {self._squares} entries")
-            variance = variance + (self._cov_maps @ cov.ravel().take(self._entries))[:, :, 0]
+                raise QuestionError(f"a covariance of shape {cov.shape}, wanted {self._squares} entries")
+            with np.errstate(over="ignore", invalid="ignore"):  # refused below
+                error = (self._cov_maps @ cov.ravel().take(self._entries))[:, :, 0]
+            # 0 <= c'A^t P A^t'c <= σ_max², but for rounding
+            least, most = float(error.min(initial=0.0)), float(error.max(initial=0.0))
+            if not (least >= -ROUNDING * np.abs(cov).max(initial=0.0) and most <= MAX_VARIANCE):
+                raise QuestionError(f"a covariance with variances of {least:.3g} to {most:.3g} along the limits")
+            variance = variance + error
             np.maximum(variance, 0.0, out=variance)
         return np.sqrt(variance).ravel().take(self._places)
 

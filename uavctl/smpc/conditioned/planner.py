@@ -31,7 +31,16 @@ import numpy as np
 from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
-from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite
+from uavctl.smpc.answer import (
+    INPUT_TOLERANCE,
+    KEPT_TOLERANCE,
+    NOMINAL,
+    Answer,
+    Preview,
+    QuestionError,
+    clip_inputs,
+    is_finite,
+)
 from uavctl.smpc.batch import Decisions, gather_answers
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
@@ -107,7 +116,7 @@ class _PlanResult(msgspec.Struct, frozen=True, eq=False):
 
 
 class ConditionedSolver:
-    """Answers from one strictly convex program for each independent part; never raises on numbers.
+    """Answers from one strictly convex program for each independent part.
 
     The reference is the equilibrium nearest to the target at which a plan may rest, see `compute_reference_backoffs`.
     An answer depends on its question alone, bit for bit. Not for concurrent use.
@@ -227,7 +236,13 @@ class ConditionedSolver:
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
-        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); see `Solver`."""
+        """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); see `Solver`.
+
+        Raises:
+            QuestionError: The age is not within the horizon, or the covariance cannot be.
+        """
+        if not 0 <= preview.age < self.problem.horizon:
+            raise QuestionError(f"a position {preview.age} steps old; budgets are for 0 to {self.problem.horizon - 1}")
         if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         rest = self._find_rest(target, preview)
@@ -330,7 +345,7 @@ class ConditionedSolver:
         """
         key = allocation is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
-            sigma, age = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
+            sigma, age = self._deviations.compute(preview.cov), preview.age
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
             backoff = allocation.quantiles[age] * sigma
             self._cached_backoffs = (

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -126,7 +126,7 @@ def add_relaxed(design: Design, answer: Answer, components: Sequence[Component],
     """Add the relaxed constraints to an answer, if there are any."""
     if max(answer.slack, answer.terminal_miss) <= KEPT_TOLERANCE and preview.limits is None:
         return answer
-    return replace(answer, relaxed=find_relaxed(design, answer, components, preview))
+    return structs.replace(answer, relaxed=find_relaxed(design, answer, components, preview))
 
 
 def find_relaxed(
@@ -209,7 +209,7 @@ class ConicSolver:
 
         Numbers that are not finite give an answer FAILED, as does a solver that breaks down; nothing is raised.
         """
-        if not is_finite(x, target, preview) or preview.age > len(self._design.late):
+        if not is_finite(x, target, preview) or not 0 <= preview.age <= len(self._design.late):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         if preview.age:
             return self._find_late_solver(preview.age).solve(seq, x, target, structs.replace(preview, age=0))

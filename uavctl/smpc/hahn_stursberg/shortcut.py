@@ -211,7 +211,7 @@ class ShortcutSolver:
         self, x: Array, target: Array, preview: Preview
     ) -> tuple[Design, list[tuple[Component, list[MethodAnswer]]]]:
         """Return the answers of each component from states (M, n_x), with their design."""
-        is_known = preview.age < len(self._variants)
+        is_known = 0 <= preview.age < len(self._variants)
         design, parts = self._variants[preview.age if is_known else 0]
         answerable = _is_answerable(x, target, preview) & is_known
         shares = []

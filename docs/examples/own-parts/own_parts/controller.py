@@ -1,26 +1,41 @@
-"""A regulator that pulls at the target, by hand."""
+"""A regulator that keeps its speed within what braking before the limits allows."""
 
 import numpy as np
 
 from uavctl.smpc.batch import Information, predict
+from uavctl.smpc.braking import Braking
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.outside import PlanRequest
 
+SHARE = 0.7  # of the velocity that allows a stop: gusts and losses need the rest
+AHEAD_S = 0.5  # time in which it comes to that velocity
+
 
 class Careful:
-    """The LQ regulator at half of its strength: one class for flights, what-ifs and campaigns."""
+    """The LQ regulator, as slow as the limits ask: one class for flights, what-ifs and campaigns."""
 
     def __init__(self, problem: ControlProblem) -> None:
-        self.problem, self.k = problem, 0.5 * lqr(problem.plant, problem.q_x, problem.q_u).k
+        self.problem, self.k = problem, lqr(problem.plant, problem.q_x, problem.q_u).k
+        self.limits = np.array(problem.state_set.bounds)[:, list(problem.plant.velocity_index)]
 
     def plan(self, request: PlanRequest) -> np.ndarray:
         """Inputs (H, n_u) of the steps to come: what is done now, and what in silence."""
         plant, x, inputs = self.problem.plant, request.state, []
-        low, high = self.problem.input_set.bounds
+        acting = np.zeros(plant.n_u) if request.sent is None else request.sent
         for wanted, held in zip(request.states, request.inputs, strict=True):
-            inputs.append(np.clip(held + self.k @ (x - wanted), low, high))
-            x = plant.a @ x + plant.b @ inputs[-1]
+            accel = self.slow_down(plant.accel_map @ (held + self.k @ (x - wanted)), x, acting, request.braking)
+            acting = np.clip(np.linalg.pinv(plant.accel_map) @ accel, *self.problem.input_set.bounds)
+            inputs.append(acting)
+            x = plant.a @ x + plant.b @ acting
         return np.array(inputs)
+
+    def slow_down(self, accel: np.ndarray, x: np.ndarray, acting: np.ndarray, braking: Braking) -> np.ndarray:
+        """Acceleration (n_axes,) that leads to a velocity from which a stop is in time."""
+        plant = self.problem.plant
+        position, velocity = x[list(plant.position_index)], x[list(plant.velocity_index)]
+        limits = braking.compute_velocity_limits(position + AHEAD_S * velocity, plant.accel_map @ acting)
+        low, high = np.clip(SHARE * limits, *self.limits)
+        return np.clip(accel, (low - velocity) / AHEAD_S, (high - velocity) / AHEAD_S)
 
     def begin(self, runs: int) -> None:
         """Forget everything: `runs` new runs of a campaign begin."""
