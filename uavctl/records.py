@@ -308,9 +308,6 @@ class InternalError(Record, frozen=True, kw_only=True):
     effect: InternalErrorEffect
 
 
-FLIGHT_ITEM = "flight"  # name of the item that tells the risk of a whole flight
-
-
 class Checked(Record, frozen=True, kw_only=True):
     """One item of the check before arming; nothing that the loop decides, so a replay passes it over."""
 

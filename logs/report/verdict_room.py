@@ -1,4 +1,4 @@
-"""Verdict on the room: what was promised of the flight before it began, and whether it left the room."""
+"""Verdict on the room: what is promised of such flights, and whether this one left it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ import numpy as np
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import RELATIVE_TOLERANCE, count
-from uavctl.records import FLIGHT_ITEM
 
 
 class RoomVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Promise of the check before arming, and what the flown boundaries show."""
+    """Promise for a flight, and what the flown boundaries show."""
 
-    promised: str | None  # the check's sentence; None where none is recorded
+    promised: str | None  # what rehearsed flights did, in words; None where none were rehearsed
     steps: int  # flown boundaries whose position is known
     outside: int  # of these, beyond a limit of the position
     beyond_m: float | None  # furthest beyond a limit; negative: the least distance kept [m]. None: not known
@@ -22,7 +21,7 @@ class RoomVerdict(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def text(self) -> str:
         """Promise and observation in words."""
-        return f"promised: {self.promised or 'not recorded'}; observed: {self._observation}"
+        return f"promised: {self.promised or 'not rehearsed'}; observed: {self._observation}"
 
     @property
     def _observation(self) -> str:
@@ -36,11 +35,14 @@ class RoomVerdict(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-def judge_room(flight: FlightData) -> RoomVerdict:
+def judge_room(flight: FlightData, promised: str | None = None) -> RoomVerdict:
     """Compare the positions at the flown boundaries with the room; fences do not count.
 
     Where the truth is unknown, an estimate whose position is older than plans reach is a mere prediction, and is left
     out.
+
+    Args:
+        promised: What rehearsed flights did, in words.
     """
     design, steps = flight.design, flight.steps
     index, box = list(design.position_index), design.state_box
@@ -53,7 +55,7 @@ def judge_room(flight: FlightData) -> RoomVerdict:
     tolerance_m = RELATIVE_TOLERANCE * np.maximum(1.0, np.abs(positions_m[is_known]))
     is_judged = beyond_m.size > 0 and bool(np.isfinite([lower_m, upper_m]).any())
     return RoomVerdict(
-        promised=next((check.value for check in flight.checks if check.name == FLIGHT_ITEM), None),
+        promised=promised,
         steps=len(beyond_m),
         outside=int(np.count_nonzero((beyond_m > tolerance_m).any(axis=1))),
         beyond_m=float(beyond_m.max()) if is_judged else None,

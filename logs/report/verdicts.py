@@ -39,15 +39,19 @@ class Judgement:
     innovations: InnovationSamples | None
 
 
-def judge_flight(flight: FlightData) -> Judgement:
-    """Judge a flight by its records."""
+def judge_flight(flight: FlightData, promised: str | None = None) -> Judgement:
+    """Judge a flight by its records.
+
+    Args:
+        promised: What rehearsed flights did, in words; see `judge_room`.
+    """
     config = read_flown_config(flight)
     samples = None if config is None else compute_innovations(flight, config)
     model = None if samples is None else judge_innovations(samples, flight.design.axes, flight.design.dt_s)
     verdicts = Verdicts(
         level=LEVEL,
         risk=judge_risk(flight, config),
-        room=judge_room(flight),
+        room=judge_room(flight, promised),
         link=judge_link(flight, config),
         model=model,
         clocks=judge_clocks(flight),

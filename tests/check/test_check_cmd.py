@@ -31,7 +31,7 @@ from uavctl.records import Checked, Event
 OF_TIME = frozenset(
     {"vehicle", "position rate", "position age", "longest gap", "position loss", "vehicle clock", "source clock"}
 )
-NO_REHEARSALS = ("--set", "check.rehearsals=0")  # they take seconds, and are tested by themselves
+NO_REHEARSALS = ("--rehearsals", "0")  # they take seconds, and are tested by themselves
 
 
 def accept(*names: str) -> list[str]:
@@ -111,7 +111,7 @@ def test_people_get_problems_first_and_a_line_for_what_is_good(
 @pytest.mark.fault(15)
 def test_fly_does_not_arm_with_a_wrong_frame(urls: list[str], tmp_path: Path) -> None:
     out = tmp_path / "flight"
-    options = ["--arm", "--takeoff", "1", "--set", "frame.convention=enu", "--set", "check.seconds=4", *NO_REHEARSALS]
+    options = ["--arm", "--takeoff", "1", "--set", "frame.convention=enu", "--set", "check.seconds=4"]
     command = [sys.executable, "-m", "uavctl", "fly", *urls, "--out", str(out), *options]
     done = subprocess.run(command, capture_output=True, text=True, timeout=3 * LIMIT_S, check=False)
     assert done.returncode == 1

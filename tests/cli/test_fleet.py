@@ -248,8 +248,7 @@ def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
     short = tmp_path_factory.mktemp("c")  # a socket's path has 107 bytes at most
     monkeypatch.setenv(FOLDER_VARIABLE, str(short))
     path = tmp_path / "fleet.toml"
-    quick = ("check.seconds=0.2", "check.rehearsals=0")
-    path.write_text(HEAD + make_entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", *quick))
+    path.write_text(HEAD + make_entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
     (fleet_member,) = read_fleet(path).members
     flight = FleetFlight(fleet_member, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
     flight.start()

@@ -483,7 +483,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureF
     assert "in the air" in recorded.sentence
     page = report.path.with_name("again.html")
     with omit_figures():
-        code = run(["log", "report", str(report.path), "--out", str(page)])
+        code = run(["log", "report", str(report.path), "--out", str(page), "--rehearsals", "0"])
     capsys.readouterr()
     assert code == 0 and recorded.sentence in read_page_text(page)
 

@@ -23,7 +23,7 @@ from uavctl.lab.campaign.arrivals import select_newest_captures
 from uavctl.lab.flight_risk import FlightFilter, FlightRisk, bound_probability, rehearse_flights
 from uavctl.lab.trial import FlightCounts, TrackedFlyer, compute_excess_m, get_room_limits
 from uavctl.loop import ControlLoop
-from uavctl.records import FLIGHT_ITEM, PositionSample
+from uavctl.records import PositionSample
 
 NO_WALL = "sets.state_lower=[-inf,-1.5,-inf,-inf,-1.5,-inf,-inf,-1.0,-inf]"
 ONE_WALL = "sets.state_upper=[3.0,1.5,inf,inf,1.5,inf,inf,1.0,inf]"
@@ -96,6 +96,11 @@ def test_without_flights_or_walls_there_is_no_risk(overrides: tuple[str, ...]) -
     assert rehearse_config(load_config("room", ("duration_s=1", *overrides))) is None
 
 
+def test_a_flight_shorter_than_a_step_is_one_step() -> None:
+    risk = rehearse_config(load_config("room", ("duration_s=0.01", "check.rehearsals=2")))
+    assert risk is not None and (risk.steps, risk.left) == (1, 0)
+
+
 def test_the_filter_is_that_of_the_flight() -> None:
     config = load_config("room")
     design, dt_ns, rng = build_conditioned(config), 50_000_000, np.random.default_rng(5)
@@ -163,14 +168,23 @@ def test_flights_of_the_simulator_leave_as_often() -> None:
 
 def test_design_and_check_tell_it(capsys: pytest.CaptureFixture[str]) -> None:
     settings = ("duration_s=1", "check.rehearsals=5")
-    assert run(["design", "--config", "room", "--json", "--seed", "4", *(f"--set={text}" for text in settings)]) == 0
+    assert run(["design", "--json", "--seed", "4", "--rehearsals", "5", "--set=duration_s=1"]) == 0
     told = json.loads(capsys.readouterr().out)["flight_risk"]
     expected = rehearse_config(load_config("room", settings), 4)
     assert expected is not None and told == msgspec.to_builtins(expected)
     items = {item.name: item for item in make_flight_items(load_config("room", settings), seed=4)}
-    assert items[FLIGHT_ITEM].value == expected.sentence and items[FLIGHT_ITEM].ok
+    assert items["flight"].value == expected.sentence and items["flight"].ok
+
+
+@pytest.mark.parametrize("command", [("check",), ("design",)])
+@pytest.mark.parametrize("option", ["--rehearsals=-1", "--rehearsals=1001", "--rehearsals=2.5", "--seed=-1"])
+def test_a_number_of_flights_or_a_seed_that_is_none_is_refused(
+    command: tuple[str, ...], option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*command, option]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {option.partition('=')[0]} ")
 
 
 def test_flights_that_leave_are_noted_and_refuse_nothing() -> None:
     items = {item.name: item for item in make_flight_items(make_adrift(30))}
-    assert (items[FLIGHT_ITEM].state, items[FLIGHT_ITEM].ok) == ("note", True)
+    assert (items["flight"].state, items["flight"].ok) == ("note", True)

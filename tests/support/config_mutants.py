@@ -532,7 +532,7 @@ class Mutants:
                 self._replay,
                 self._whatif,
                 lambda: ["log", "info", RECORDING],
-                lambda: ["log", "report", RECORDING, "--out", "page.html"],
+                lambda: ["log", "report", RECORDING, "--out", "page.html", "--rehearsals", "0"],
                 lambda: ["log", "export", RECORDING, "--to", "csv", "--out", "tables"],
                 lambda: ["log", "compare", RECORDING, RECORDING],
                 lambda: ["log", "recover", RECORDING, "--out", "back.mcap"],

@@ -35,18 +35,17 @@ from uavctl.cli.common import (
     make_key_overrides,
     print_message,
 )
-from uavctl.cli.flight_risk import RiskSeed, compute_flight_risk
+from uavctl.cli.flight_risk import Rehearsals, RiskSeed, compute_flight_risk
 from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.config.connections import CheckConfig, find_security_warnings
 from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
-from uavctl.flight.controller import Controller
 from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.mavlink.connection import make_links
-from uavctl.records import FLIGHT_ITEM, Checked, Datagram, Sink
+from uavctl.records import Checked, Datagram, Sink
 from uavctl.smpc.conditioned.planner import ConditionedDesign
 
 MOVE_LIMIT_S = 120.0  # for the guided movements, beside the listening
@@ -200,6 +199,7 @@ def check(
     move: Annotated[
         bool, Parameter(negative=(), help="ask for movements of the body by hand, which show every axis")
     ] = False,
+    rehearsals: Rehearsals = None,
     seed: RiskSeed = 0,
     out: Annotated[Path, Parameter(help="folder that recordings will be written to")] = Path("flights"),
 ) -> int:
@@ -207,7 +207,9 @@ def check(
 
     Exit code 0: nothing speaks against flying. What could not be determined is told, and does not fail the check.
     """
-    overrides = make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds)
+    overrides = make_key_overrides(
+        daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds, check__rehearsals=rehearsals
+    )
     loaded = common.with_overrides(overrides).load()
     config = loaded.config
     with locate_design_errors(loaded):
@@ -247,7 +249,9 @@ def make_mission_items(config: Config, prepared: Prepared | None = None) -> tupl
     """
     if not config.is_age_conditioned or config.smpc.controller:
         return ()
-    design, controller = _get_rehearsed(config, prepared)
+    design = build_flight_design(config) if prepared is None else prepared.design
+    controller = build_controller(config, design) if prepared is None else prepared.controller
+    assert isinstance(design, ConditionedDesign)
     result = rehearse(config, design, controller)
     is_bad, is_noted = result.relaxes or result.leaves_trajectory, result.saturates or result.depends_on_drag
     state = ItemState.BAD if is_bad else ItemState.NOTE if is_noted else ItemState.GOOD
@@ -256,38 +260,28 @@ def make_mission_items(config: Config, prepared: Prepared | None = None) -> tupl
     return (make_item("mission", state, value, want, result.hint),)
 
 
-def make_flight_items(config: Config, prepared: Prepared | None = None, seed: int = 0) -> tuple[Item, ...]:
+def make_flight_items(config: Config, seed: int = 0) -> tuple[Item, ...]:
     """Rehearse whole flights with all that is random; no items where `make_mission_items` has none, or without walls.
 
     The item forbids nothing: at a wall, a few steps outside are as planned.
 
     Args:
-        prepared: The controller, if it is made already.
         seed: Seed of the rehearsed flights.
 
     Raises:
         DesignError: The configuration has no controller.
     """
-    if not config.is_age_conditioned or config.smpc.controller:
-        return ()
-    risk = compute_flight_risk(config, *_get_rehearsed(config, prepared), seed)
+    risk = compute_flight_risk(config, seed)
     if risk is None:
         return ()
     item = make_item(
-        FLIGHT_ITEM,
+        "flight",
         ItemState.NOTE if risk.left else ItemState.GOOD,
         risk.sentence,
         "no rehearsed flight leaves the room",
         "fly further from the limits, raise smpc.delta_x, or improve the link",
     )
     return (item,)
-
-
-def _get_rehearsed(config: Config, prepared: Prepared | None) -> tuple[ConditionedDesign, Controller]:
-    """Return design and controller, made if they are not yet."""
-    design = build_flight_design(config) if prepared is None else prepared.design
-    assert isinstance(design, ConditionedDesign)
-    return design, build_controller(config, design) if prepared is None else prepared.controller
 
 
 def make_disk_items(folder: Path, free_bytes: int) -> list[Item]:

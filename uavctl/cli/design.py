@@ -31,10 +31,11 @@ from uavctl.cli.common import (
     Common,
     WideTable,
     locate_design_errors,
+    make_key_overrides,
     make_message_console,
     make_table,
 )
-from uavctl.cli.flight_risk import RiskSeed, compute_flight_risk
+from uavctl.cli.flight_risk import Rehearsals, RiskSeed, compute_flight_risk
 from uavctl.config import Config
 from uavctl.constraint_names import describe_all_relaxed
 from uavctl.errors import UsageError
@@ -109,19 +110,20 @@ def design(
         bool,
         Parameter(negative=(), show_default=False, help="find the terminal gain of least stationary cost, and compare"),
     ] = False,
+    rehearsals: Rehearsals = None,
     seed: RiskSeed = 0,
     common: Common = DEFAULTS,
 ) -> int:
     """Make a design: schedule, terminal ingredients, Assumption 4 with figures."""
     if synthesize:
         return report_gains(common)
-    loaded = common.load()
+    loaded = common.with_overrides(make_key_overrides(check__rehearsals=rehearsals)).load()
     begin_s = time.perf_counter()
     if loaded.config.is_age_conditioned:
         with locate_design_errors(loaded):
             conditioned = build_conditioned(loaded.config)
             rehearsal = rehearse_mission(loaded.config, conditioned)
-            risk = compute_flight_risk(loaded.config, conditioned, seed=seed)
+            risk = compute_flight_risk(loaded.config, seed, conditioned)
         figures = {
             **make_conditioned_record(conditioned),
             "rehearsal": msgspec.to_builtins(rehearsal),

@@ -152,17 +152,9 @@ def fly_daemon(
             check_places(config, design, take_off_m, orders.goal)
             prepared = prepare(config, design)
         # Loaded late: it takes an eighth of the loading time of `fly`.
-        from uavctl.cli.check import (
-            check_before_arming,
-            make_flight_items,
-            make_mission_items,
-            record_items,
-            record_parameters,
-        )
+        from uavctl.cli.check import check_before_arming, make_mission_items, record_items, record_parameters
 
-        mission_items: tuple[Item, ...] = ()
-        if take_off_m is not None:
-            mission_items = (*make_mission_items(config, prepared), *make_flight_items(config, prepared))
+        mission_items = () if take_off_m is None else make_mission_items(config, prepared)
         begin_s = time.perf_counter()
         with (
             enable_realtime_process(realtime) as garbage_functions,

@@ -39,7 +39,7 @@ from logs.report.headline import derive_headline
 from logs.report.tlog_headline import derive_tlog_headline
 from logs.report.tlog_page import write_tlog_page
 from logs.report.verdict_sections import make_verdict_rows
-from logs.report.verdicts import judge_flight
+from logs.report.verdicts import judge_flight, read_flown_config
 from uavctl.cli.common import (
     Column,
     Common,
@@ -54,7 +54,8 @@ from uavctl.cli.common import (
     make_table,
     warn,
 )
-from uavctl.errors import UsageError
+from uavctl.cli.flight_risk import Rehearsals, compute_flight_risk
+from uavctl.errors import DesignError, UsageError
 
 
 def compare_command(
@@ -129,9 +130,13 @@ def report(
     out: Annotated[Path | None, Parameter(help="page to write; else beside the recording")] = None,
     svg: Annotated[Path | None, Parameter(help="also write a small picture of the flight")] = None,
     system: System = None,
+    rehearsals: Rehearsals = None,
     json: Json = False,
 ) -> int:
-    """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else."""
+    """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else.
+
+    The page has the probability that such a flight leaves the room, by rehearsals, beside what this flight did.
+    """
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         refuse_recording_path(target)
@@ -141,7 +146,7 @@ def report(
     data = FlightData.from_records(read(flight), flight)
     dropped = max((note.dropped for note in data.notes), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
-    verdicts = judge_flight(data)
+    verdicts = judge_flight(data, _rehearse_flown(data, rehearsals))
     if svg is not None:
         write_atomically(svg, draw_overview(data))
     write_report(data, summary, page, verdicts)
@@ -155,6 +160,21 @@ def report(
         lambda: _render_report(headline, make_summary_table(summary, make_verdict_rows(verdicts.verdicts))),
     )
     return 0
+
+
+def _rehearse_flown(flight: FlightData, rehearsals: int | None) -> str | None:
+    """Rehearse the recorded configuration, each time for as long as was flown; return the result in words."""
+    config = read_flown_config(flight)
+    if config is None or not flight.steps:
+        return None
+    replace, check = msgspec.structs.replace, config.check
+    if rehearsals is not None:
+        check = replace(check, rehearsals=rehearsals)
+    try:
+        risk = compute_flight_risk(replace(config, check=check, duration_s=len(flight.steps) * flight.design.dt_s))
+    except DesignError:  # this version refuses what an older one flew
+        return None
+    return None if risk is None else risk.sentence
 
 
 def _render_report(headline: Headline, summary: RenderableType) -> Group:

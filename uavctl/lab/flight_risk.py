@@ -106,7 +106,8 @@ def rehearse_flights(
     if not flights or not np.isfinite([lower_m, upper_m]).any():
         return None
     motion = controller.mission.trajectory
-    steps = min(MAX_STEPS, round(config.duration_s / design.plant.dt_s) if motion is None else len(motion.states))
+    steps = max(1, round(config.duration_s / design.plant.dt_s)) if motion is None else len(motion.states)
+    steps = min(MAX_STEPS, steps)
     draws = _draw(config, design.plant, flights, steps, seed)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not a number is outside
         positions_m = _fly(config, design, controller, draws, report_progress)

@@ -16,6 +16,7 @@ from logs.recording.reader import read, read_header
 from logs.recording.recorder import SyncRecorder
 from uavctl.build.controller import build_conditioned, build_flight_design, compute_reference_limits, make_design_record
 from uavctl.cli.app import run as main
+from uavctl.cli.flight_risk import compute_flight_risk
 from uavctl.config import dump_config, load_config
 from uavctl.config.types import ScheduleConfig, SmpcConfig
 from uavctl.records import ControlMode, Decision, Header, Plan, SolveStatus, Truth
@@ -53,7 +54,7 @@ def quick(folder: Path) -> str:
 @pytest.mark.usefixtures("_no_other_design", "no_page")
 def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, flight = quick(tmp_path), str(tmp_path / "flight.mcap")
-    assert main(["design", "--config", config, "--set", "check.rehearsals=0", "--json"]) == 0
+    assert main(["design", "--config", config, "--rehearsals", "0", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert main(["loopback", "--config", config, "--duration", "5", "--out", str(tmp_path), "--json"]) == 0
     flown = json.loads(capsys.readouterr().out)
@@ -66,7 +67,13 @@ def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys
     assert read_design(reported).horizon == 48
     assert main(["log", "replay", flight, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"]
-    assert main(["log", "report", flight, "--json"]) == 0
+    assert main(["log", "report", flight, "--rehearsals", "3", "--json"]) == 0
+    room = json.loads(capsys.readouterr().out)["verdicts"]["room"]
+    flights = (f"duration_s={0.05 * room['steps']}", "check.rehearsals=3")
+    risk = compute_flight_risk(load_config(config, flights))
+    assert risk is not None and room["promised"] == risk.sentence and room["outside"] == 0
+    assert main(["log", "report", flight, "--rehearsals", "0", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["verdicts"]["room"]["promised"] is None
     assert main(["log", "whatif", flight, "--set", "link.loss=0.4", "--out", str(tmp_path / "whatif")]) == 0
     assert main(["solve", "--config", config, "--state", "0,0,0,0,0,0,-1,0,0"]) == 0
 
@@ -152,4 +159,4 @@ def test_a_recording_under_the_name_of_the_other_design_replays(
     capsys.readouterr()
     assert main(["log", "replay", str(old), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"]
-    assert main(["log", "report", str(old), "--json"]) == 0
+    assert main(["log", "report", str(old), "--rehearsals", "0", "--json"]) == 0
