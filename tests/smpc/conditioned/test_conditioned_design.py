@@ -62,7 +62,7 @@ def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys
     reported = read_header(Path(flight))
     assert reported.design_id == figures["design_id"] == reported.design["design_id"]
     assert {
-        key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")
+        key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal", "flight_risk")
     } == reported.design
     assert read_design(reported).horizon == 48
     assert main(["log", "replay", flight, "--json"]) == 0
