@@ -58,6 +58,7 @@ from uavctl.flight.monitors.inertial import ComparedSource, InertialObservation
 from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
+from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
 from uavctl.records import ControlMode, Estimate, Order
@@ -196,11 +197,13 @@ def _judge_estimate(
         return NO_VERDICT, NO_VERDICT
     has_drifted = change.inertial_wrong_ns is None and _has_drifted(state, belief, view, context)
     resumed_ns, knows_noise = state.monitors.engaged.motion.resumed_ns, measured.samples.sources.noise.is_known
-    has_returned = resumed_ns is not None and context.at_ns - resumed_ns < RETURNED_NS
+    returned_ns = math.inf if resumed_ns is None else context.at_ns - resumed_ns
+    has_returned = returned_ns < RETURNED_NS
     if has_returned and knows_noise and change.supports_velocity(context.at_ns):
         is_new = any(read_capture_ns(sample) == belief.inertial.distrusted_ns for sample in measured.samples.accepted)
         is_recent = (view.age_steps or 0) < PLAYED_OUT_STEPS
-        if is_new or (is_recent and (has_drifted or _is_apart(state, belief, view, context))):
+        compares = returned_ns >= CORRECTS_NS
+        if is_new or (is_recent and (has_drifted or (compares and _is_apart(state, belief, view, context)))):
             return _POSITIONS_CONTRADICTED, NO_VERDICT
     consistent = change.inertial_wrong_ns is None and not has_drifted
     comparison = InertialObservation(ComparedSource.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
