@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from deception_rig import draw_flight, fly_deceived
+from deception_rig import BLACKOUT_S, DeceivedFlight, Deception, draw_flight, fly_deceived
+
+from uavctl.records import ControlMode
 
 OUTSIDE_M = 0.5  # beyond a wall or the ceiling
 # Seeds that went furthest outside before both velocities were compared: by 2.0 to 4.0 m.
@@ -14,6 +16,15 @@ CAME_BACK = (53, 3051, 6004, 6019, 6021, 6035, 7006, 8083)
 # The same by 0.9 to 5.4 m before a velocity was compared alone where inertial data are known to be wrong. Nor did the
 # vehicle land where its velocity had been found wrong and no position came.
 WRONG_VELOCITY = (6054, 9046, 10189)
+# Seeds, plants and lies, each with its time after the blackout began. They were outside by 0.8 to 0.95 m: the first two
+# while the velocity to brake on was predicted since the last position, though the own one had been right since then;
+# the last two while positions were not compared with the own velocity where inertial data were distrusted.
+AFTER_ANOTHER = (
+    (30005, "quadrotor", (("attitude", "delayed", -0.8), ("velocity", "swapped", 0.7))),
+    (30013, "quadrotor", (("attitude", "delayed", -0.8), ("velocity", "swapped", 0.7))),
+    (30005, "quadrotor", (("positions", "scaled", 2.0),)),
+    (30006, "linear", (("positions", "delayed", 2.0),)),
+)
 WORST_LINEAR = (287, 290, 316, 323)  # of 71 flights of the linear plant, both autopilots
 
 
@@ -30,3 +41,33 @@ WORST_LINEAR = (287, 290, 316, 323)  # of 71 flights of the linear plant, both a
 def test_the_true_vehicle_stays_near_the_room(seed: int, plant: str) -> None:
     flight = fly_deceived(*draw_flight(seed, plant))
     assert flight.outside_m <= OUTSIDE_M + 0.05 and flight.begin_mps > 0.2
+
+
+def fly_lies(seed: int, plant: str, lies: tuple[tuple[str, str, float], ...]) -> tuple[DeceivedFlight, float]:
+    """Fly a drawn flight with other lies; return it and when its blackout begins [s]."""
+    config, believed, controller, _, blackout_s = draw_flight(seed, plant)
+    deceptions = [Deception(source, kind, blackout_s + after_s) for source, kind, after_s in lies]
+    return fly_deceived(config, believed, controller, deceptions, blackout_s), blackout_s
+
+
+@pytest.mark.slow
+@pytest.mark.fault(94)
+@pytest.mark.fault(95)
+@pytest.mark.parametrize(("seed", "plant", "lies"), AFTER_ANOTHER)
+def test_lies_one_after_another_and_positions_that_come_back(
+    seed: int, plant: str, lies: tuple[tuple[str, str, float], ...]
+) -> None:
+    flight, _ = fly_lies(seed, plant, lies)
+    assert flight.outside_m <= OUTSIDE_M and flight.begin_mps > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(("seed", "kind"), [(30000, "flipped"), (30001, "scaled")])
+def test_lasting_lies_of_inertial_data_alone_do_not_brake_at_every_lost_position(seed: int, kind: str) -> None:
+    """Braking and plans took turns, 7 to 11 times in 4 s, as long as they lasted."""
+    flight, blackout_s = fly_lies(seed, "quadrotor", (("inertial", kind, BLACKOUT_S - 0.3),))
+    assert flight.modes is not None
+    later = [mode for at_s, mode in flight.modes if at_s > blackout_s + BLACKOUT_S + 1.5]
+    assert ControlMode.BRAKE not in later and flight.modes[-1][1] is ControlMode.TRACK
+    assert flight.outside_m <= OUTSIDE_M

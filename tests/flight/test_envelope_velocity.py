@@ -161,7 +161,7 @@ def test_a_distance_that_begins_anew_is_not_compared_with_what_was_before(known:
 
 
 @pytest.mark.parametrize(
-    ("silent_s", "off_m", "ends"), [(1.5, 0.42, False), (1.5, 0.45, True), (4.0, 1.26, False), (4.0, 1.3, True)]
+    ("silent_s", "off_m", "ends"), [(1.5, 0.26, False), (1.5, 0.29, True), (4.0, 0.68, False), (4.0, 0.72, True)]
 )
 @pytest.mark.fault(95)
 def test_positions_come_back_near_the_vehicle_s_own_way(silent_s: float, off_m: float, ends: bool) -> None:

@@ -233,3 +233,21 @@ def test_a_velocity_found_wrong_in_a_silence_ends_the_flight_on_plans(is_wrong: 
     assert state.fallback.flown is not None
     wanted = FallbackReason.VELOCITY_WRONG if is_wrong and is_silent else FallbackReason.RECOVER
     assert state.fallback.flown.reason is wanted
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("right_mps", [2.0, -2.0])
+def test_a_silence_is_braked_on_the_last_own_velocity_that_was_right(right_mps: float) -> None:
+    ours, last = controller(), 5 + make_controller().horizon + 1
+    inputs = make_inputs(range((last + 5) * TICKS), make_step_samples(range(5, last + 1), steps=last + 5))
+    state = make_initial_state()
+    for inp in inputs[: last * TICKS]:
+        state, _ = run_tick(state, inp, ours)
+    for inp in inputs[last * TICKS :]:
+        found = VelocityChangeState(velocity_wrong_ns=inp.at_ns, right_beside_model_mps=(right_mps, 0.0, 0.0))
+        engaged = replace(state.monitors.engaged, velocity_change=found)
+        state = replace(state, monitors=replace(state.monitors, engaged=engaged))
+        state, _ = run_tick(state, replace(inp, samples=()), ours)
+        if state.mode is not ControlMode.BRAKE:
+            break
+    assert state.plan.sent_mps2[0] * right_mps < 0.0

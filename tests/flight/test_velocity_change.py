@@ -116,11 +116,39 @@ def test_a_velocity_that_repeats_is_found_without_inertial_data_but_not_at_rest(
 
 
 @pytest.mark.fault(94)
-@pytest.mark.parametrize(("leap_mps", "is_wrong"), [(0.75, False), (0.85, True), (-0.85, True)])
-def test_a_velocity_that_leaps_is_found_in_that_message_without_inertial_data(leap_mps: float, is_wrong: bool) -> None:
-    states = fly(40, lambda s, v: v + (leap_mps if s >= LAG_S else 0.0), lambda _s, _a: None)
-    found = [tick for tick, state in enumerate(states) if is_found(state) == (True, False)]
+@pytest.mark.parametrize("inertial_wrong_ns", [None, START_NS])
+@pytest.mark.parametrize(("beyond_mps", "is_wrong"), [(-0.05, False), (0.05, True)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_velocity_that_leaps_is_found_in_that_message_without_inertial_data(
+    sign: float, beyond_mps: float, is_wrong: bool, inertial_wrong_ns: int | None
+) -> None:
+    bound_mps = 0.255 + 0.05 * (6.0 if inertial_wrong_ns is None else 3.0)
+    leap_mps, state = sign * (bound_mps + beyond_mps), VelocityChangeState(inertial_wrong_ns=inertial_wrong_ns)
+    states = fly(40, lambda s, v: v + (leap_mps if s >= LAG_S else 0.0), lambda _s, _a: None, state=state)
+    found = [tick for tick, state in enumerate(states) if state.velocity_wrong_ns is not None]
     assert found[:1] == ([round(LAG_S / 0.05)] if is_wrong else [])
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(
+    "lie", [lambda s, v: -v if s >= LAG_S else v, lambda s, v: v - 1.5 * max(s - LAG_S, 0.0), lambda _s, v: max(v, 2.5)]
+)
+def test_the_velocity_before_the_lie_is_kept_with_what_setpoints_change_since(
+    lie: Callable[[float, float], float],
+) -> None:
+    last, first = 59, VelocityChangeState(inertial_wrong_ns=START_NS)
+    right = fly(last + 1, lie, lambda s, a: a if s < LAG_S else -a, state=first)[-1].right_beside_model_mps
+    # Setpoints have given ACCEL since the lag is over: both change alike.
+    model_mps = fly(last + 1, true, true)[-1].samples[-1][3]
+    assert right is not None and right[0] + model_mps[0] == pytest.approx(SPEED_MPS + 0.05 * last * ACCEL[0], abs=0.3)
+
+
+def test_no_velocity_is_kept_while_the_own_one_is_right() -> None:
+    wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO)
+    positions = VelocityState(offsets=((START_NS + 1, ZERO),), apart_mps=0.0)
+    (state,) = fly(1, true, true, state=wrong, velocity=positions)
+    assert state.right_beside_model_mps is None
+    assert {one.right_beside_model_mps for one in fly(40, true, true)} == {None}
 
 
 def test_nothing_is_compared_while_positions_correct_the_velocity() -> None:

@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -396,9 +397,14 @@ def _is_velocity_wrong(phase: _Phase) -> bool:
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
     """Whether the vehicle's own inertial data carry the estimate on, with nothing against it."""
+    return not fallback.is_final and _is_inertial_new(belief)
+
+
+def _is_inertial_new(belief: Belief | None) -> bool:
+    """Whether inertial data of now are in a belief."""
     if belief is None or belief.inertial.used_ns is None or belief.inertial.distrusted_ns is not None:
         return False
-    return not fallback.is_final and belief.at_ns - belief.inertial.used_ns <= MAX_INERTIAL_AGE_NS
+    return belief.at_ns - belief.inertial.used_ns <= MAX_INERTIAL_AGE_NS
 
 
 def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, supervised: Supervised) -> Vec3:
@@ -420,12 +426,24 @@ def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, su
 
 
 def find_braking_velocity(context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
-    """Find the velocity to brake on, and whether it is the vehicle's own; else it is the predicted one."""
-    estimate, plant = supervised.view.estimate, context.controller.plant
+    """Find the velocity to brake on, and whether it is the vehicle's own.
+
+    Else it is the predicted one. Where only setpoints carry that on, and the own velocity was right until a moment ago,
+    it is that velocity and what setpoints have changed since: it is newer than the last position.
+    """
+    estimate, plant, monitors = supervised.view.estimate, context.controller.plant, supervised.monitors.engaged
     predicted = read_velocity(estimate, plant)
-    observation = observe_velocity(supervised.monitors.engaged, estimate, context)
-    if observation is None or observation.own_mps is None or not judge_vehicle_velocity(observation).is_none:
+    observation = observe_velocity(monitors, estimate, context)
+    if observation is not None and observation.own_mps is not None and judge_vehicle_velocity(observation).is_none:
+        return _select_known(observation.own_mps, plant), True
+    right, belief = monitors.velocity_change.right_beside_model_mps, supervised.view.belief
+    if right is None or _is_inertial_new(belief) or not are_positions_lost(belief, context.at_ns):
         return predicted, False
-    own = observation.own_mps
-    north, east, down = (v if axis in plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))
-    return (north, east, down), True
+    # v = (v_0 - m_0) + m
+    return _select_known([v + m for v, m in zip(right, monitors.motion.model_mps, strict=True)], plant), False
+
+
+def _select_known(velocity_mps: Sequence[float], plant: Plant) -> Vec3:
+    """Return a velocity with zero in each axis that the plant lacks."""
+    north, east, down = (v if axis in plant.axes else 0.0 for axis, v in zip(AXES, velocity_mps, strict=True))
+    return north, east, down

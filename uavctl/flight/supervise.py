@@ -58,6 +58,7 @@ from uavctl.flight.monitors.inertial import ComparedSource, InertialObservation
 from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
+from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
 from uavctl.records import ControlMode, Estimate, Order
@@ -196,10 +197,13 @@ def _judge_estimate(
         return NO_VERDICT, NO_VERDICT
     has_drifted = change.inertial_wrong_ns is None and _has_drifted(state, belief, view, context)
     resumed_ns, knows_noise = state.monitors.engaged.motion.resumed_ns, measured.samples.sources.noise.is_known
-    has_returned = resumed_ns is not None and context.at_ns - resumed_ns < RETURNED_NS
+    returned_ns = math.inf if resumed_ns is None else context.at_ns - resumed_ns
+    has_returned = returned_ns < RETURNED_NS
     if has_returned and knows_noise and change.supports_velocity(context.at_ns):
         is_new = any(read_capture_ns(sample) == belief.inertial.distrusted_ns for sample in measured.samples.accepted)
-        if is_new or (has_drifted and (view.age_steps or 0) < PLAYED_OUT_STEPS):
+        is_recent = (view.age_steps or 0) < PLAYED_OUT_STEPS
+        compares = returned_ns >= CORRECTS_NS
+        if is_new or (is_recent and (has_drifted or (compares and _is_apart(state, belief, view, context)))):
             return _POSITIONS_CONTRADICTED, NO_VERDICT
     consistent = change.inertial_wrong_ns is None and not has_drifted
     comparison = InertialObservation(ComparedSource.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
@@ -208,10 +212,16 @@ def _judge_estimate(
 
 def _has_drifted(state: ControlState, belief: Belief, view: FilterView, context: TickContext) -> bool:
     """Whether a velocity by inertial data has drifted away from the vehicle's own, which changes alike and steadily."""
-    trust, motion, controller = belief.inertial, context.inputs.motion, context.controller
-    bounds, change = controller.envelope, state.monitors.engaged.velocity_change
+    trust = belief.inertial
     if trust.distrusted_ns is not None or trust.used_ns is None or trust.used_ns <= belief.captured_ns:
         return False
+    return _is_apart(state, belief, view, context)
+
+
+def _is_apart(state: ControlState, belief: Belief, view: FilterView, context: TickContext) -> bool:
+    """Whether the estimated velocity is apart from the vehicle's own, which inertial data do not contradict."""
+    motion, controller = context.inputs.motion, context.controller
+    bounds, change = controller.envelope, state.monitors.engaged.velocity_change
     own = read_vehicle_velocity(motion, context.at_ns)
     if bounds is None or own is None or motion is None or motion.velocity_ns is None:
         return False
@@ -333,10 +343,11 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
     """Judge whether a plan may fly on without positions: not where what carries the estimate on is wrong, or lost."""
     if (view.age_steps or 0) < PLAYED_OUT_STEPS or view.belief is None:
         return NO_VERDICT
-    if monitors.velocity_change.has_found_wrong:
+    trust, change = view.belief.inertial, monitors.velocity_change
+    if change.velocity_wrong_ns is not None:
         return _CONTRADICTED
-    trust = view.belief.inertial
-    is_lost = trust.distrusted_ns is not None or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
+    is_wrong = change.inertial_wrong_ns is not None or trust.distrusted_ns is not None
+    is_lost = is_wrong or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
     return _CARRIED_BY_NOTHING if is_lost and are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
 
 

@@ -40,9 +40,9 @@ PLAIN = 1.5  # this many times the bound is beyond it at once
 CORRECTS_NS = 1_000_000_000
 UNRESOLVED_NS = 600_000_000  # longest time without positions after a contradiction
 # Distance of the first position after a silence from the vehicle's own way, in disagreements of the velocity, and its
-# growth with t². Flights of real autopilots' software and of simulated ones had up to 0.44 m after 4 s in wind:
-# a third of the bound.
-RETURN_S, RETURN_1PS = 1.2, 0.24
+# growth with t². Flights of real autopilots' software had up to 0.42 m after 4 s, simulated ones 0.44 m in wind: less
+# than two thirds of the bound.
+RETURN_S, RETURN_1PS = 0.8, 0.12
 LATE_S = 0.15  # largest difference between the delays of positions and of the vehicle's own velocity
 SMOOTHED_S = 0.3  # the same with smoothing inside a camera system, which makes positions follow late
 SHORTEST = 0.3  # of the window: over less, two velocities are not compared
@@ -151,7 +151,7 @@ def _find_return(
         return None
     (then_ns, then), (at_ns, now) = before[-1], offsets[-1]
     s, off = (at_ns - then_ns) * 1e-9, [b - a for a, b in zip(then, now, strict=True)]
-    # |o - o_0| > (1.2 s + 0.24 1/s t²) v_max
+    # |o - o_0| > (0.8 s + 0.12 1/s t²) v_max
     bound_m = (RETURN_S + RETURN_1PS * s * s) * observation.parameters.disagreement_mps
     return (s, off) if math.hypot(*off) > bound_m else None
 
