@@ -594,7 +594,7 @@ CASES = {
     "term-in-climb": Case(signals(signal.SIGTERM), moment="climb", code=1),
     "hup-in-climb": Case(signals(signal.SIGHUP), moment="climb", code=1),
     "hup-in-landing": Case(signals(signal.SIGHUP), moment="landing"),
-    "int-in-landing": Case(signals(signal.SIGINT), moment="landing"),
+    "int-in-landing": Case(signals(signal.SIGINT), moment="landing", code=130),
     "ctrl-z": Case(stop_and_go, stops=False),
     "starved": Case(starve, stops=False, code=1),
     "stderr-full": Case(signals(signal.SIGTERM), stderr="full"),
@@ -609,7 +609,7 @@ CASES = {
     "file-size-in-climb": Case(limit_files, moment="climb", stops=False, code=1),
     "folder-removed": Case(remove_folder, stops=False, flies_on=True, replays=False, code=1),
     "camera-killed": Case(kill_child("uavctl.io.camera_host"), natnet=True, stops=False),
-    "camera-killed-5": Case(kill_child("uavctl.io.camera_host", 5), natnet=True, stops=False),
+    "camera-killed-5": Case(kill_child("uavctl.io.camera_host", 5), natnet=True, stops=False, code=1),
     "live-killed": Case(
         kill_child("logs.live.host"), options=("--live", "--live-port", "0"), stops=False, flies_on=True
     ),

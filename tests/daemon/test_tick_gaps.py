@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from uavctl.daemon.tick_gaps import GAP_NS, MAX_GAPS, SPAN_NS, GapLimit
+from uavctl.daemon.tick_gaps import MAX_GAPS, SPAN_NS, GapLimit
 from uavctl.errors import UavctlError
+from uavctl.flight.context import GAP_NS
 
 LONG_NS = GAP_NS + 1
 

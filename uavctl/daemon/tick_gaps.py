@@ -1,7 +1,7 @@
 """Limit of the gaps between ticks: a computer that is too busy to fly ends the flight.
 
-A single gap is bridged by the vehicle. After several, each new setpoint ends a failsafe of PX4 before its heartbeat has
-shown it, and flies on until the next gap.
+After a single gap the flight waits for the vehicle's heartbeat (`uavctl.flight.decide`). Several show that the next one
+is near, in which the vehicle would fly the last setpoint until its own timeout.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from collections import deque
 
 from uavctl.arrays import SECOND_NS
 from uavctl.errors import UavctlError
+from uavctl.flight.context import GAP_NS
 
-GAP_NS = SECOND_NS // 2  # PX4's documentation requires two setpoints a second
 MAX_GAPS = 2  # within `SPAN_NS`; a single pause of a computer may make two
 SPAN_NS = 10 * SECOND_NS
 

@@ -23,6 +23,10 @@ from uavctl.smpc.plant import Plant
 
 _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # modes in which the controller does not fly
 
+# Without setpoints a vehicle flies by its own failsafe soon: PX4's documentation requires two setpoints a second.
+GAP_NS = 500_000_000
+AFTER_GAP = f"no tick has run for more than {GAP_NS * 1e-9:g} s, and no heartbeat has shown the vehicle's mode since"
+
 
 class TickContext(msgspec.Struct, frozen=True, eq=False):
     """All that is known when a tick begins."""
@@ -38,6 +42,7 @@ class TickContext(msgspec.Struct, frozen=True, eq=False):
     was_in_control: bool  # whether the controller flew the vehicle in the tick before
     not_ready_reason: str  # why the vehicle takes no setpoints; empty if it does
     is_controllable: bool  # whether the vehicle is known to be in the air and to take setpoints
+    gap_end_ns: int | None  # end of a long gap between ticks, after which no heartbeat has come yet
 
 
 class FilterView(msgspec.Struct, frozen=True, eq=False):
@@ -56,6 +61,9 @@ def locate_on_grid(
     # k = n div (Δt / tick)
     step, into = divmod(inputs.tick, controller.ticks_per_step)
     mode, not_ready_reason, vehicle = state.mode, describe_not_ready(inputs.vehicle), inputs.vehicle
+    gap_end_ns = _find_gap_end_ns(state.plan.gap_end_ns, inputs, controller.tick_ns)
+    if gap_end_ns is not None and not not_ready_reason:
+        not_ready_reason = AFTER_GAP
     return TickContext(
         inputs=inputs,
         at_ns=inputs.at_ns,
@@ -68,7 +76,17 @@ def locate_on_grid(
         was_in_control=mode not in _NOT_FLOWN,
         not_ready_reason=not_ready_reason,
         is_controllable=vehicle is not None and not not_ready_reason and not vehicle.landed and not vehicle.own_climb,
+        gap_end_ns=gap_end_ns,
     )
+
+
+def _find_gap_end_ns(before_ns: int | None, inputs: StepInput, tick_ns: int) -> int | None:
+    """Find the end of a long gap after which the vehicle's mode is not known; None where it is."""
+    if (inputs.missed_ticks + 1) * tick_ns > GAP_NS:
+        return inputs.at_ns
+    # Heartbeats of the gap are read at its end, up to one tick after the grid time of that tick.
+    is_heard = before_ns is not None and inputs.vehicle is not None and inputs.vehicle.at_ns > before_ns + tick_ns
+    return None if is_heard else before_ns
 
 
 def describe_not_ready(vehicle: VehicleStatus | None) -> str:

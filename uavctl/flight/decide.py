@@ -1,7 +1,8 @@
 """Phase 4 of a tick: make a new plan, continue the old one, or fall back.
 
 1. The operator's orders change the fallback, then verdicts that end the plans, then the operator's stop.
-2. A vehicle that is handed over, is not heard, or takes no setpoints gets no plan.
+2. A vehicle that is handed over, is not heard, or takes no setpoints gets no plan. After a long gap between ticks
+   nothing is sent to it until it is heard again.
 3. A final fallback flies on. A verdict to brake begins the fallback.
 4. Otherwise each Δt boundary decides. At an age of H the fallback flies. A new position gives a new plan, and so do new
    inertial data where the solver counts the age. Without either, the old plan is flown on.
@@ -19,7 +20,7 @@ from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
-from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
+from uavctl.flight.context import AFTER_GAP, FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import make_estimate, select_covariance
 from uavctl.flight.fallback import (
@@ -173,6 +174,10 @@ def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
     at_ns, fallback = phase.context.at_ns, draft.fallback
     if fallback is not None and fallback.is_over:
         return _fall_back(draft, fallback, phase, "handed over")
+    if why_not == AFTER_GAP:
+        # Its own failsafe may have the vehicle. A setpoint would end that of PX4.
+        due = fallback if fallback is not None and fallback.is_final else None
+        return replace(draft, plan=None, fallback=due, reason=why_not, sends_nothing=True)
     is_stopped = inputs.stop or (fallback is not None and fallback.reason is FallbackReason.STOP)
     if why_not and is_stopped:
         ended = Fallback(mode=ControlMode.STOPPED, since_ns=at_ns, reason=FallbackReason.STOP)

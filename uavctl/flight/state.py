@@ -81,6 +81,7 @@ class PlanGroup(msgspec.Struct, frozen=True, eq=False):
     decided_step: int | None = None  # step of the last tick
     sent_mps2: Vec3 = ZERO  # the last setpoint
     sent_yaw_rad: float | None = None  # its yaw; None if it had none
+    gap_end_ns: int | None = None  # end of a long gap between ticks, after which no heartbeat has come yet
 
 
 class FallbackGroup(msgspec.Struct, frozen=True, eq=False):

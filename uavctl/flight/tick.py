@@ -118,6 +118,7 @@ def _make_state(
             decided_step=context.step,
             sent_mps2=ZERO if acted.setpoint is None else acted.setpoint.accel_mps2,
             sent_yaw_rad=None if acted.setpoint is None else acted.setpoint.yaw_rad,
+            gap_end_ns=context.gap_end_ns,
         ),
         fallback=FallbackGroup(
             flown=decided.fallback,
