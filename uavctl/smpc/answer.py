@@ -44,6 +44,10 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
     # None: it can do all of that
     inputs: tuple[Array, Array] | None = None
 
+    # Level of the budgets of the risk by age: 0 is the certificate for any link, -1 that of the configured link
+    level: int = -1
+    widening: float = 1.0  # factor of all standard deviations of the rows
+
     @property
     def nominal(self) -> bool:
         """Whether the preview adds nothing to the design."""

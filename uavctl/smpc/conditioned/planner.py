@@ -33,6 +33,7 @@ from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite
 from uavctl.smpc.batch import Decisions, gather_answers
+from uavctl.smpc.conditioned.adaptation import LevelChoice
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
     DISTANT_SHARE,
@@ -64,6 +65,9 @@ ROUNDS = 2  # rounds of an allocation
 MAX_ROUNDS = (
     3  # rounds if the plan does not keep its back-offs; half of the plans between two near walls need the third
 )
+# Largest budget of an age at each level between the certificate and the configured link, as a multiple of the allowed
+# risk: steps of a factor of at most two, so that a record frees risk gradually
+CAPS = (1.25, 1.6, 2.5, 5.0)
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
@@ -86,6 +90,15 @@ class _Allocation:
     distant: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
     # Distance of the reference from each row (n, m), by the number of rows that limit a target
     reference_backoffs: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RiskLevel:
+    """Allocations of one level of the budgets. Level 0 is the certificate, the last one that of the configured link."""
+
+    near: _Allocation  # beside limits and along motions
+    transit: _Allocation  # where the target is far from all limits
+    far: Array  # distance (m,) of a target from each row beyond which it is far from it
 
 
 class _Rest(msgspec.Struct, frozen=True, eq=False):
@@ -119,6 +132,7 @@ class ConditionedSolver:
         slew_mps3: Largest change of the acceleration setpoint in a second [m/s³], see `SlewRows`; infinite: no limit.
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
+        adapts: Whether there are levels of the budgets below that of the configured link.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
@@ -134,6 +148,8 @@ class ConditionedSolver:
         slew_mps3: float = math.inf,
         cov: Array | None = None,
         filter_plant: Plant | None = None,
+        *,
+        adapts: bool = False,
     ) -> None:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
@@ -188,29 +204,40 @@ class ConditionedSolver:
                 reference_backoffs,
             )
 
-        self._near = make_allocation(allocate_by_age(link, self._find_pacing_deviations(), allowed, exponent, n_parts))
-        self._transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
+        pacing = self._find_pacing_deviations()
+
+        def make_near(cap: float) -> _Allocation:
+            return make_allocation(allocate_by_age(link, pacing, allowed, exponent, n_parts, cap))
+
+        transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
+        self.levels: tuple[RiskLevel, ...] = (self._make_level(make_near(1.0), transit, allowed),)
+        if adapts:
+            age_probabilities = transit.risk.age_probabilities
+            certificate = make_allocation(AgeRisk(age_probabilities, 0.0, np.full(steps, allowed)))
+            capped = (make_near(cap * allowed) for cap in CAPS)
+            self.levels = (
+                *(self._make_level(near, certificate, allowed) for near in (certificate, *capped)),
+                *self.levels,
+            )
+        self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
+        self._cached_backoffs: tuple[tuple[bool, int, int, float, bytes], _RowBackoffs] | None = None
+
+    def _make_level(self, near: _Allocation, transit: _Allocation, allowed: float) -> RiskLevel:
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
-        counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
+        counts = int(np.count_nonzero(transit.risk.budgets < 1.0))
         oldest = self._deviations.compute(None)[max(0, counts - 1)]
-        self._far = np.maximum(
-            self._transit.reference_backoffs[-1], float(quantile(np.array(allowed / n_parts))) * oldest
-        )
-        # Without limits of a preview: bounds on a target far from limits, and on one that needs no reference
-        self._plain_far = (self._b - self._far)[self._reference_rows]
-        self._plain_near = (self._b - self._near.reference_backoffs[0])[self._reference_rows]
-        self._cached_rest: tuple[bytes, _Rest] | None = None
-        self._cached_backoffs: tuple[tuple[bool, int, bytes], _RowBackoffs] | None = None
+        far = np.maximum(transit.reference_backoffs[-1], float(quantile(np.array(allowed / len(self._parts)))) * oldest)
+        return RiskLevel(near, transit, far)
 
     @property
     def risk(self) -> AgeRisk:
         """Risk by age near limits and along motions."""
-        return self._near.risk
+        return self.levels[-1].near.risk
 
     @property
     def transit_risk(self) -> AgeRisk:
         """Risk by age where the target is far from all limits."""
-        return self._transit.risk
+        return self.levels[-1].transit.risk
 
     def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
@@ -221,7 +248,7 @@ class ConditionedSolver:
     def reference_limits(self) -> Array:
         """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self._near.reference_backoffs[-1]
+        sides[self._rows] -= self.levels[-1].near.reference_backoffs[-1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
@@ -283,7 +310,7 @@ class ConditionedSolver:
         """Find where a plan rests; that of the last target is kept, by its bits, without limits or a path."""
         if preview.limits is not None or preview.path is not None:
             return self._make_rest(target, preview)
-        key = target.tobytes()
+        key = preview.level, preview.widening, target.tobytes()
         if self._cached_rest is None or self._cached_rest[0] != key:
             self._cached_rest = key, self._make_rest(target, preview)
         return self._cached_rest[1]
@@ -291,7 +318,7 @@ class ConditionedSolver:
     def _make_rest(self, target: Array, preview: Preview) -> _Rest:
         held, limits = self._equilibria.held, self._limits(preview)
         placed = self._placed.dot(target[held])
-        reference = self._find_reference(target, placed, limits)
+        reference = self._find_reference(target, placed, limits, preview)
         return _Rest(
             allocation=self._select_allocation(placed, limits, preview),
             reference=reference,
@@ -313,34 +340,36 @@ class ConditionedSolver:
         Args:
             placed: Values of the rows of resting places at the target.
         """
+        level = self.levels[preview.level]
         if preview.path is not None:
-            return self._near
-        kept = self._plain_far
-        if limits is not self._b:
-            kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._reference_rows]
-        return self._transit if np.count_nonzero(placed <= kept) == kept.size else self._near
+            return level.near
+        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        kept = (sides - preview.widening * level.far)[self._reference_rows]
+        return level.transit if np.count_nonzero(placed <= kept) == kept.size else level.near
 
     def _find_row_backoffs(self, allocation: _Allocation, preview: Preview) -> _RowBackoffs:
         """Return the back-offs for a preview; the last ones are cached, by the bits of their arguments."""
-        key = allocation is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
+        cov_bytes = b"" if preview.cov is None else preview.cov.tobytes()
+        level = self.levels[preview.level]
+        key = allocation is level.transit, preview.level, preview.age, preview.widening, cov_bytes
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
-            sigma, age = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
+            sigma = preview.widening * self._deviations.compute(preview.cov)
+            age = min(preview.age, self.problem.horizon - 1)
             self._cached_backoffs = (
                 key,
                 _RowBackoffs(sigma, allocation.budgets[age], allocation.shared[age] * sigma, allocation.distant[age]),
             )
         return self._cached_backoffs[1]
 
-    def _find_reference(self, target: Array, placed: Array, limits: Array) -> Array:
+    def _find_reference(self, target: Array, placed: Array, limits: Array, preview: Preview) -> Array:
         """Return the equilibrium (n_x,) nearest to the target; the rows that limit it share the budgets."""
-        sides, kept = limits, self._plain_near
-        if limits is not self._b:
-            sides = limits if limits.ndim == 1 else limits.min(axis=0)
-            kept = (sides - self._near.reference_backoffs[0])[self._reference_rows]
+        backoffs = self.levels[preview.level].near.reference_backoffs
+        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        kept = (sides - preview.widening * backoffs[0])[self._reference_rows]
         reference, count = np.array(target), np.count_nonzero(placed > kept)
         if not count:
             return reference
-        distance = self._near.reference_backoffs[min(int(count), len(self._parts)) - 1]
+        distance = preview.widening * backoffs[min(int(count), len(self._parts)) - 1]
         for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
@@ -591,3 +620,16 @@ def conditioned_record(design: ConditionedDesign) -> dict[str, object]:
         "slack_linear": problem.slack_linear,
         "slack_quadratic": problem.slack_quadratic,
     }
+
+
+def make_level_choice(solver: ConditionedSolver, allowed: float) -> LevelChoice:
+    """Make the data by which a level of the budgets is chosen.
+
+    Args:
+        allowed: 1 - δ_x.
+    """
+    risk = solver.risk
+    budgets = np.array([level.near.risk.budgets for level in solver.levels])
+    # What is older than the horizon counts in full; the certificate knows no link, and promises nothing of it.
+    older = np.append(allowed, np.ones(len(budgets) - 1))[:, None]
+    return LevelChoice(allowed, np.append(risk.age_probabilities, risk.older_probability), np.hstack([budgets, older]))
