@@ -285,6 +285,8 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
         ("daemon", "parameters"): "false",
         ("daemon", "radio_channels"): "false",
         ("relay", "vehicle_time"): "false",
+        ("risk", "adapt"): "false",
+        ("risk", "budgets"): '"configured"',
         ("smpc", "scheme"): '"hahn-stursberg"',
     }
     missing = [

@@ -328,6 +328,21 @@ class RiskConfig(Section, frozen=True, kw_only=True):
             "estimate that positions alone give, with the covariance of its error in every back-off of a state"
         ),
     ] = "exact"
+    budgets: Annotated[
+        Literal["certificate", "observed", "configured"],
+        Meta(
+            description="risk of each age of information, with scheme `age-conditioned`: `certificate` holds on any "
+            "link; `observed` gives more to rare ages as far as the link in flight agrees with `[link]`; `configured` "
+            "holds on a link as in `[link]` alone"
+        ),
+    ] = "observed"
+    adapt: Annotated[
+        bool,
+        Meta(
+            description="keep further away from limits in flight while they are left more often than allowed, and "
+            "nearer while less often, with scheme `age-conditioned`"
+        ),
+    ] = True
 
 
 class SolverConfig(Section, frozen=True, kw_only=True):

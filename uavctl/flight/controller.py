@@ -13,6 +13,7 @@ from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.mission import Mission
 from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.outliers import GateParameters, Reach, make_reach
+from uavctl.flight.risk_state import RiskParameters
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.plant import Plant
 
@@ -43,6 +44,7 @@ class Controller:
     outside: str = ""  # name of the controller of another package that is the solver; empty: it is one of ours
     # Least and largest input (n_u,) that may be sent, bias included; None: those of the design
     inputs: tuple[Array, Array] | None = None
+    risk: RiskParameters | None = None  # parameters of the risk; None: the design's budgets fly
     envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: no monitor of motion runs
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others

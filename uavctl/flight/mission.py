@@ -241,6 +241,12 @@ def _row(mission: Mission, state: MissionState, at_ns: int, motion: Trajectory) 
     return min((at_ns - state.start_ns - state.paused_ns) // mission.dt_ns, len(motion.states) - 1)
 
 
+def find_limits(mission: Mission, state: MissionState | None, at_ns: int) -> Array:
+    """Return the right sides (m_x,) of the state rows at a time."""
+    moving = None if state is None else _limits(mission, at_ns - state.start_ns)
+    return mission.limits if moving is None else moving[0]
+
+
 def _limits(mission: Mission, since_ns: int) -> Array | None:
     """Right sides of the state rows in stages 0 … H (H+1, m_x); None where no fence is closer than they are."""
     if not mission.fences:

@@ -20,6 +20,10 @@ INPUT_TOLERANCE = 1e-6
 KEPT_TOLERANCE = 1e-6
 
 
+CERTIFICATE_LEVEL = 0  # level of the budgets of the risk that holds on any link
+CONFIGURED_LEVEL = -1  # level of the budgets of the risk that is made for the configured link
+
+
 class Path(msgspec.Struct, frozen=True, eq=False):
     """A trajectory to follow, as deviations from the target."""
 
@@ -44,8 +48,8 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
     # None: it can do all of that
     inputs: tuple[Array, Array] | None = None
 
-    # Level of the budgets of the risk by age: 0 is the certificate for any link, -1 that of the configured link
-    level: int = -1
+    # Level of the budgets of the risk by age
+    level: int = CONFIGURED_LEVEL
     widening: float = 1.0  # factor of all standard deviations of the rows
 
     @property

@@ -123,8 +123,8 @@ def simulate_loop(risk_of_widening: float, steps: int) -> tuple[LoopState, float
 def test_the_loop_brings_the_mean_risk_to_the_allowed_one(risk: float) -> None:
     state, mean = simulate_loop(risk, 6000)
     span = math.log(adaptation.MAX_WIDENING / adaptation.MIN_WIDENING)
-    assert mean <= ALLOWED * (1.0 + span / (adaptation.GAIN * 6000))
-    assert risk / state.widening**3 == pytest.approx(ALLOWED, rel=0.1)
+    assert mean <= ALLOWED * (adaptation.TARGET + span / (adaptation.GAIN * 6000))
+    assert risk / state.widening**3 == pytest.approx(adaptation.TARGET * ALLOWED, rel=0.1)
 
 
 def test_any_sequence_of_risks_keeps_the_bound_of_the_mean_below_saturation() -> None:
@@ -136,7 +136,7 @@ def test_any_sequence_of_risks_keeps_the_bound_of_the_mean_below_saturation() ->
         total += risk
         state = charge_risk(state, risk, ALLOWED, keeps_away=True)
         assert not state.is_saturated
-        assert total / step <= ALLOWED * (1.0 + span / (adaptation.GAIN * step))
+        assert total / step <= ALLOWED * (adaptation.TARGET + span / (adaptation.GAIN * step))
 
 
 def test_the_loop_saturates_where_nothing_helps() -> None:

@@ -10,9 +10,9 @@
    more of them.
 3. *Loop.* With the risk r_k of a step, given all that is known in it, all standard deviations are multiplied by f:
 
-       log f <- log f + γ (r_k - α) / α
+       log f <- log f + γ (r_k / α - 0.95)
 
-   As long as f is within its bounds, the mean of r_k over T steps is at most α (1 + log(f_max / f_min) / (γ T)).
+   As long as f is within its bounds, the mean of r_k over T steps is at most α (0.95 + log(f_max / f_min) / (γ T)).
 
 All functions are pure: they depend on their arguments alone.
 """
@@ -31,15 +31,16 @@ from uavctl.smpc.conditioned.backoffs import violation_risk
 
 HALF_LIFE_STEPS = 2000.0  # a step this old counts half: some two minutes at 20 Hz
 CONFIDENCE = 0.95  # level of each bound of a share
-MATCH_STEPS = 10.0  # length of a matching record at which the configured link counts as much as the record
-CONTRADICTION = 4.0  # standard deviations from the configured link at which a record contradicts it
+MATCH_STEPS = 3.0  # length of a matching record at which the configured link counts as much as the record
+CONTRADICTION = 4.0  # standard deviations by which a record that contradicts the configured link is worse
 AGREEMENT = 2.0  # standard deviations within which a record no longer contradicts it
-AGREEMENT_STEPS = 200.0  # least length of a record that no longer contradicts: a short one agrees with most links
+AGREEMENT_STEPS = 1000.0  # least length of a record that no longer contradicts: a short one agrees with most links
 # Shares of the allowed risk by which the bounds may exceed it: where a level begins, and where it ends. The budgets of
 # all levels use all of it on the configured link, and bounds never fall to the link itself
 BEGIN_TOLERANCE = 0.05
 END_TOLERANCE = 0.08
 REVIEW_STEPS = 10  # steps between two choices of a level
+TARGET = 0.95  # share of α that the loop controls to: the rest is for the noise of f
 GAIN = 0.002  # γ: an error of f falls to half in some 100 steps; 0.004 costs 6 % at a wall on the configured link
 FIRST_STEPS = 60.0  # k_0: the gain is 1 / (k_0 + k) while that is larger than γ, so the loop begins faster
 MIN_WIDENING = 0.75  # least f
@@ -123,7 +124,7 @@ def choose_level(lower: Array, upper: Array, choice: LevelChoice, before: int = 
 
 
 def find_contradiction(counts: Array, choice: LevelChoice) -> float:
-    """Return how many standard deviations the record is from the configured link."""
+    """Return how many standard deviations the record is worse than the configured link."""
     # A run of losses is one draw: Y = Σ_{t<=G} v_t with P(G >= t) = π_t / π_1, Σ_t π_t v_t = 0
     begins = int(choice.shares.argmax())
     runs = float(counts[begins])
@@ -133,7 +134,7 @@ def find_contradiction(counts: Array, choice: LevelChoice) -> float:
     ends = np.zeros(len(choice.shares))
     ends[begins:] = survival - np.append(survival[1:], 0.0)
     variance = sums**2 @ ends
-    return float(np.max(np.abs(values @ counts) / np.sqrt(np.maximum(variance * max(runs, 1.0), 1e-300))))
+    return float(np.max((values @ counts) / np.sqrt(np.maximum(variance * max(runs, 1.0), 1e-300))))
 
 
 class LoopState(msgspec.Struct, frozen=True):
@@ -161,10 +162,12 @@ def charge_risk(state: LoopState, risk: float, allowed: float, *, keeps_away: bo
         keeps_away: Whether the plan keeps away from a limit. Elsewhere nothing is saved for later.
     """
     # γ_k = max(γ, 1 / (k_0 + k))
-    change = max(GAIN, 1.0 / (FIRST_STEPS + state.steps)) * (risk - allowed) / allowed
+    change = max(GAIN, 1.0 / (FIRST_STEPS + state.steps)) * (risk / allowed - TARGET)
     if change < 0.0 and not keeps_away:
         change = max(change, -max(state.log_widening, 0.0))
-    log_widening = min(max(state.log_widening + change, math.log(MIN_WIDENING)), math.log(MAX_WIDENING))
+    # A few steps inside are no evidence: f falls no lower than the last gain would have taken it.
+    least = max(math.log(MIN_WIDENING), -GAIN * state.steps)
+    log_widening = min(max(state.log_widening + change, least), math.log(MAX_WIDENING))
     return LoopState(log_widening, state.steps + keeps_away)
 
 

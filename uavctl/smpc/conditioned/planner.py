@@ -54,7 +54,7 @@ from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant, digest
 from uavctl.smpc.qp import OPEN
-from uavctl.smpc.sets import Polytope, find_equilibria
+from uavctl.smpc.sets import Polytope, find_equilibria, find_pairs
 
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design
@@ -206,25 +206,30 @@ class ConditionedSolver:
 
         pacing = self._find_pacing_deviations()
 
-        def make_near(cap: float) -> _Allocation:
-            return make_allocation(allocate_by_age(link, pacing, allowed, exponent, n_parts, cap))
-
+        near = make_allocation(allocate_by_age(link, pacing, allowed, exponent, n_parts))
         transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
-        self.levels: tuple[RiskLevel, ...] = (self._make_level(make_near(1.0), transit, allowed),)
+        self.levels: tuple[RiskLevel, ...] = (self._make_level(near, transit, transit.risk, allowed),)
         if adapts:
-            age_probabilities = transit.risk.age_probabilities
-            certificate = make_allocation(AgeRisk(age_probabilities, 0.0, np.full(steps, allowed)))
-            capped = (make_near(cap * allowed) for cap in CAPS)
+            # Where a target is far from all limits, limits matter in transit only, and all levels share one allocation.
+            possible = np.arange(steps) < self._count_possible_ages(cov, allowed)
+            certificate = AgeRisk(transit.risk.age_probabilities, 0.0, np.where(possible, allowed, 1.0))
+            capped = (allocate_by_age(link, pacing, allowed, exponent, n_parts, cap * allowed) for cap in CAPS)
+            lower = (replace(risk, budgets=np.where(possible, risk.budgets, 1.0)) for risk in (certificate, *capped))
             self.levels = (
-                *(self._make_level(near, certificate, allowed) for near in (certificate, *capped)),
+                *(self._make_level(make_allocation(risk), transit, risk, allowed) for risk in lower),
                 *self.levels,
             )
         self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
         self._cached_backoffs: tuple[tuple[bool, int, int, float, bytes], _RowBackoffs] | None = None
 
-    def _make_level(self, near: _Allocation, transit: _Allocation, allowed: float) -> RiskLevel:
+    def _make_level(self, near: _Allocation, transit: _Allocation, kept: AgeRisk, allowed: float) -> RiskLevel:
+        """Make a level.
+
+        Args:
+            kept: Budgets whose oldest age with a back-off decides which targets are far from limits.
+        """
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
-        counts = int(np.count_nonzero(transit.risk.budgets < 1.0))
+        counts = int(np.count_nonzero(kept.budgets < 1.0))
         oldest = self._deviations.compute(None)[max(0, counts - 1)]
         far = np.maximum(transit.reference_backoffs[-1], float(quantile(np.array(allowed / len(self._parts)))) * oldest)
         return RiskLevel(near, transit, far)
@@ -373,6 +378,21 @@ class ConditionedSolver:
         for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
+
+    def _count_possible_ages(self, cov: Array | None, allowed: float) -> int:
+        """Count the ages at which all rows can keep an equal share of the allowed risk between opposite limits.
+
+        At older ages the certificate keeps nothing back: no plan could.
+        """
+        sigma = self._deviations.compute(cov)
+        needed = float(quantile(np.array(allowed / max(1, self._rows.size)))) * sigma
+        # β_ti + β_tj <= b_i + b_j for c_i = -c_j
+        possible = np.ones(len(sigma), dtype=np.bool_)
+        for pair in find_pairs(self._c):
+            if len(pair.sides) == 2:  # opposite limits
+                rows = [row for _, row in pair.sides]
+                possible &= needed[:, rows].sum(axis=1) <= self._b[rows].sum()
+        return int(np.logical_and.accumulate(possible).sum())
 
     def _find_pacing_deviations(self) -> Array:
         """Return the deviations (H,) for the allocation to the ages: those of the position with the largest one."""
