@@ -85,4 +85,8 @@ def _find_outside_risk(
     cov = select_covariance(kalman, belief)[:n_x, :n_x]
     # m = b - C x̂,  σ² = diag(C P C')
     margins = find_limits(context.controller.mission, mission, context.boundary_ns) - rows @ belief.mean[:n_x]
-    return compute_outside_risk(margins, np.einsum("mi,ij,mj->m", rows, cov, rows), risk.loop.widening)
+    # Behind the horizon no plan keeps f times the deviation: with f there, a long silence would raise f without end.
+    age_steps = supervised.view.age_steps
+    is_planned = age_steps is not None and age_steps < context.controller.horizon
+    widening = risk.loop.widening if is_planned else 1.0
+    return compute_outside_risk(margins, np.einsum("mi,ij,mj->m", rows, cov, rows), widening)
