@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import msgspec
-import numpy as np
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import TickContext
@@ -89,4 +88,4 @@ def _find_outside_risk(
     age_steps = supervised.view.age_steps
     is_planned = age_steps is not None and age_steps < context.controller.horizon
     widening = risk.loop.widening if is_planned else 1.0
-    return compute_outside_risk(margins, np.einsum("mi,ij,mj->m", rows, cov, rows), widening)
+    return compute_outside_risk(margins, ((rows @ cov) * rows).sum(axis=1), widening)
