@@ -19,7 +19,7 @@ MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs t
 ReceivedItem = PositionSample | VehicleStatus | VehicleMotion | InertialSample | CommandAck | StatusText
 
 
-class Arrivals(NamedTuple):
+class TickMessages(NamedTuple):
     """Messages and orders that a tick takes, each kind in the order in which it came."""
 
     samples: tuple[PositionSample, ...]
@@ -48,7 +48,7 @@ class Inbox:
         self._orders.append(command)
         return True
 
-    def take(self, at_ns: int) -> Arrivals:
+    def take(self, at_ns: int) -> TickMessages:
         """Take what is due in the tick of `at_ns`."""
         samples: list[PositionSample] = []
         inertial: list[InertialSample] = []
@@ -73,7 +73,7 @@ class Inbox:
         self._items = later_items
         self._orders.clear()
         newest_inertial = tuple(inertial[-MAX_INERTIAL:])
-        return Arrivals(_select_newest(samples), newest_inertial, tuple(statuses), motion, tuple(messages), orders)
+        return TickMessages(_select_newest(samples), newest_inertial, tuple(statuses), motion, tuple(messages), orders)
 
 
 def _select_newest(samples: list[PositionSample]) -> tuple[PositionSample, ...]:

@@ -19,14 +19,19 @@ KILLING = [
 @pytest.mark.fault(86)
 @pytest.mark.parametrize("number", KILLING)
 def test_each_signal_that_would_kill_asks_for_the_end(number: int) -> None:
-    before = signal.getsignal(number)
-    with stop_on_signals() as stopped:
-        assert not stopped()
-        signal.raise_signal(number)
-        assert stopped()
-        if number not in DELIBERATE:
-            signal.raise_signal(number)  # timers and closed terminals repeat theirs
-    assert signal.getsignal(number) == before
+    found = signal.getsignal(number)
+    before = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    signal.signal(number, before)  # nohup and shells in the background ignore some
+    try:
+        with stop_on_signals() as stopped:
+            assert not stopped()
+            signal.raise_signal(number)
+            assert stopped()
+            if number not in DELIBERATE:
+                signal.raise_signal(number)  # timers and closed terminals repeat theirs
+        assert signal.getsignal(number) == before
+    finally:
+        signal.signal(number, found)
 
 
 @pytest.mark.fault(86)

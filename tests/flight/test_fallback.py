@@ -29,9 +29,8 @@ PARAMETERS = FallbackParameters(
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, SOURCE_FAILED, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, ENVELOPE, STOP, TO_LAND = (
+RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, ENVELOPE, STOP, TO_LAND = (
     FallbackReason.RECOVER,
-    FallbackReason.SOURCE_FAILED,
     FallbackReason.CONTROLLER_FAILED,
     FallbackReason.POSITIONS_DISTRUSTED,
     FallbackReason.ENVELOPE,
@@ -174,15 +173,7 @@ def test_an_end_that_is_asked_for(before: Fallback | None, reason: FallbackReaso
 
 
 def test_there_is_a_way_back_from_one_end_only() -> None:
-    assert [Fallback(HOLD, 0, reason).is_final for reason in FallbackReason] == [
-        False,
-        True,
-        True,
-        True,
-        True,
-        True,
-        True,
-    ]
+    assert [reason for reason in FallbackReason if not Fallback(HOLD, 0, reason).is_final] == [RECOVER]
 
 
 def test_what_has_been_handed_over_has_ended() -> None:

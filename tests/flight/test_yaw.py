@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uavctl.flight.yaw import LEAST_MPS, RECENT_NS, YawMode, YawParameters, compute_yaw
+from uavctl.flight.yaw import MIN_SPEED_MPS, RECENT_NS, YawMode, YawParameters, compute_yaw
 from uavctl.records import Vec3, VehicleMotion
 
 TICK_S, AT_NS = 0.05, 9_000_000_000
@@ -48,7 +48,7 @@ def test_it_begins_at_the_vehicle_s_own_yaw_and_waits_there_without_a_plan(param
 
 @pytest.mark.parametrize(
     ("planned_mps", "yaw_deg"),
-    [((1.0, 0.0, 0.0), 0.0), ((0.0, 1.0, -3.0), 90.0), ((-1.0, -1.0, 0.0), -135.0), ((0.0, LEAST_MPS, 0.0), 90.0)],
+    [((1.0, 0.0, 0.0), 0.0), ((0.0, 1.0, -3.0), 90.0), ((-1.0, -1.0, 0.0), -135.0), ((0.0, MIN_SPEED_MPS, 0.0), 90.0)],
 )
 def test_path_settles_along_the_planned_motion(planned_mps: Vec3, yaw_deg: float) -> None:
     assert math.degrees(settle(3.0, planned_mps, PATH)) == pytest.approx(yaw_deg)

@@ -24,7 +24,7 @@ from uavctl.flight.limits import ZERO, limit_setpoint
 from uavctl.flight.measure import Measured
 from uavctl.flight.state import ControlState
 from uavctl.flight.supervise import Supervised
-from uavctl.flight.yaw import compute_yaw
+from uavctl.flight.yaw import YawMode, compute_yaw
 from uavctl.records import ControlMode, Setpoint, SetpointSource, Vec3
 from uavctl.smpc.plant import Plant
 
@@ -84,9 +84,9 @@ def _make_setpoint(
 
 
 def _compute_yaw(state: ControlState, context: TickContext, decided: Decided) -> float | None:
-    """Compute the yaw setpoint [rad]; none for a vehicle that others fly, which turns as they want."""
+    """Compute the yaw setpoint [rad]; none where yaw is held, or others fly the vehicle and turn it as they want."""
     controller, plan = context.controller, decided.plan
-    if context.not_ready_reason:
+    if context.not_ready_reason or controller.yaw.mode is YawMode.HOLD:
         return None
     planned_mps = None
     if plan is not None:

@@ -38,7 +38,7 @@ from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.risk import set_risk
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
-from uavctl.flight.supervise import Supervised, are_inertial_lost, are_positions_lost, observe_velocity
+from uavctl.flight.supervise import Supervised, are_positions_lost, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.plant import Plant
@@ -52,7 +52,7 @@ COMPARED_NS = CORRECTS_NS + 400_000_000
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL_TEXTS = {
-    FallbackReason.SOURCE_FAILED: "no position came, and the vehicle's own velocity or inertial data failed",
+    FallbackReason.VELOCITY_WRONG: "no position came, and the vehicle's own velocity was found wrong",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
     FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
     FallbackReason.ENVELOPE: "what is seen cannot be",
@@ -116,8 +116,8 @@ def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
     fallback = ordered.fallback
     for reason in supervised.fallback_reasons:
         fallback = request_fallback(fallback, reason, at_ns)
-    if fallback is not None and _has_source_failed(phase):
-        fallback = request_fallback(fallback, FallbackReason.SOURCE_FAILED, at_ns)
+    if fallback is not None and _is_velocity_wrong(phase):
+        fallback = request_fallback(fallback, FallbackReason.VELOCITY_WRONG, at_ns)
     before, outliers = state.fallback.flown, state.estimator.sources.outliers
     is_final = fallback is not None and fallback.is_final
     becomes_final = is_final and not (before is not None and before.is_final)
@@ -388,11 +388,11 @@ def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     )
 
 
-def _has_source_failed(phase: _Phase) -> bool:
-    """Whether no position comes, and one of the vehicle's own sources was found wrong, or is lost."""
-    belief, at_ns = phase.view.belief, phase.context.at_ns
-    is_wrong = phase.supervised.monitors.engaged.velocity_change.has_found_wrong
-    return are_positions_lost(belief, at_ns) and (is_wrong or are_inertial_lost(belief, at_ns))
+def _is_velocity_wrong(phase: _Phase) -> bool:
+    """Whether no position comes, and the vehicle's own velocity was found wrong."""
+    supervised = phase.supervised
+    is_wrong = supervised.monitors.engaged.velocity_change.velocity_wrong_ns is not None
+    return is_wrong and are_positions_lost(supervised.view.belief, phase.context.at_ns)
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:

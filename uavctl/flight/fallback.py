@@ -6,7 +6,7 @@ A state machine of four modes, each with a time limit:
 
     reason                 from HOLD
     RECOVER                LAND after hold_s, or blind_hold_s, if configured; else it holds on
-    SOURCE_FAILED          LAND once its zero has been sent, if configured; else STOPPED
+    VELOCITY_WRONG         LAND once its zero has been sent, if configured; else STOPPED
     CONTROLLER_FAILED      the same
     POSITIONS_DISTRUSTED   the same
     ENVELOPE               the same; it does not brake before, as no position is believed: level at once
@@ -58,8 +58,8 @@ class FallbackReason(IntEnum):
     """Reason of the fallback, which decides its end. A greater one overrides a smaller one, for good."""
 
     RECOVER = auto()  # too few positions: plans fly again once they are back
-    # No position came, and one of the vehicle's own sources was wrong or lost: positions could not be checked.
-    SOURCE_FAILED = auto()
+    # No position came, and the vehicle's own velocity was found wrong: positions that come back could not be checked.
+    VELOCITY_WRONG = auto()
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
     ENVELOPE = auto()  # a monitor found the motion impossible: no plan again, and no braking

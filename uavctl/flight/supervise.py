@@ -335,21 +335,14 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
         return NO_VERDICT
     if monitors.velocity_change.has_found_wrong:
         return _CONTRADICTED
-    is_carried = not are_positions_lost(view.belief, context.at_ns) or not are_inertial_lost(view.belief, context.at_ns)
-    return NO_VERDICT if is_carried else _CARRIED_BY_NOTHING
+    trust = view.belief.inertial
+    is_lost = trust.distrusted_ns is not None or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
+    return _CARRIED_BY_NOTHING if is_lost and are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
 
 
 def are_positions_lost(belief: Belief | None, at_ns: int) -> bool:
     """Whether no position has come for a while."""
     return belief is None or at_ns - belief.captured_ns > LOST_NS
-
-
-def are_inertial_lost(belief: Belief | None, at_ns: int) -> bool:
-    """Whether inertial data were used, and are distrusted now or have not come for a while."""
-    if belief is None:
-        return False
-    trust = belief.inertial
-    return trust.distrusted_ns is not None or at_ns - (trust.used_ns or at_ns) > LOST_NS
 
 
 def _is_likely(track: OutlierTrack | None) -> bool:

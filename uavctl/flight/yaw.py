@@ -1,7 +1,7 @@
 """Yaw setpoint: held by the vehicle, along the motion, or at a given angle. Pure.
 
 1. HOLD sends no yaw.
-2. PATH wants the direction of the planned horizontal velocity; below `LEAST_MPS` it keeps the last yaw setpoint.
+2. PATH wants the direction of the planned horizontal velocity; below `MIN_SPEED_MPS` it keeps the last yaw setpoint.
 3. ANGLE wants a fixed angle.
 4. The setpoint begins at the vehicle's own yaw and turns the shorter way, no faster than `rate_rps`. The fallback keeps
    it.
@@ -17,7 +17,7 @@ import msgspec
 from uavctl.records import Vec3, VehicleMotion
 
 # Below this speed the direction of motion is noise: an estimated velocity errs by 0.05 m/s, a sixth of it.
-LEAST_MPS = 0.3
+MIN_SPEED_MPS = 0.3
 RECENT_NS = 500_000_000  # an attitude that is older says nothing of the vehicle's yaw now
 
 
@@ -65,7 +65,7 @@ def compute_yaw(
         north, east, _ = planned_mps
         if parameters.mode is YawMode.ANGLE:
             wanted_rad = parameters.angle_rad
-        elif math.hypot(north, east) >= LEAST_MPS:
+        elif math.hypot(north, east) >= MIN_SPEED_MPS:
             wanted_rad = math.atan2(east, north)
     if begin_rad is None or wanted_rad is None:
         return wanted_rad

@@ -21,7 +21,7 @@ from uavctl.errors import RecordingError, UsageError
 LIMITED = """
 import resource, signal, sys
 from pathlib import Path
-from logs.recording.disk import write_atomically
+from logs.recording.output_files import write_atomically
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 write_atomically(Path(sys.argv[1]), "new" * 1000)
@@ -39,7 +39,7 @@ def test_a_text_that_does_not_fit_leaves_the_one_before(tmp_path: Path) -> None:
 
 def test_a_text_goes_through_what_is_no_file(tmp_path: Path) -> None:
     script = (
-        "from pathlib import Path; from logs.recording.disk import write_atomically; "
+        "from pathlib import Path; from logs.recording.output_files import write_atomically; "
         "write_atomically(Path('/dev/stdout'), 'a')"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

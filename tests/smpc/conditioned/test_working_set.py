@@ -45,12 +45,17 @@ def chain(steps: int, lag: float) -> tuple[np.ndarray, np.ndarray]:
     return states, np.stack([inputs, inputs - np.eye(steps, k=-1)], axis=1)
 
 
-def test_a_row_that_the_fastest_brake_leaves_is_relaxed() -> None:
+def make_guess() -> tuple[WorkingSetGuess, np.ndarray, np.ndarray]:
+    """A guess for 6 stages, and bounds: states within 10, changes of the input within 1."""
     steps = 6
-    of_x, of_u = chain(steps, 0.5)
-    first = WorkingSetGuess(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
+    states, inputs = chain(steps, 0.5)
     upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
     upper[7::2], lower[7::2] = 1.0, -1.0
+    return WorkingSetGuess(states, inputs, np.zeros(3 * steps, dtype=np.int32)), upper, lower
+
+
+def test_a_row_that_the_fastest_brake_leaves_is_relaxed() -> None:
+    first, upper, lower = make_guess()
     assert first.guess(upper, lower) is None
     # The brake makes -0.5 and -1.75 of it; then it is two steps behind, of which the next makes up one.
     upper[:2] = -3.0
@@ -63,11 +68,7 @@ def test_a_row_that_the_fastest_brake_leaves_is_relaxed() -> None:
 
 
 def test_a_setpoint_far_from_the_regulators_goes_there_as_fast_as_it_may() -> None:
-    steps = 6
-    of_x, of_u = chain(steps, 0.5)
-    first = WorkingSetGuess(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
-    upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
-    upper[7::2], lower[7::2] = 1.0, -1.0
+    first, upper, lower = make_guess()
     upper[7] = -2.0  # what was sent last is two steps behind
     begin = first.guess(upper, lower)
     assert begin is not None

@@ -36,9 +36,8 @@ class NoiseTrack(msgspec.Struct, frozen=True):
 
     last: tuple[tuple[int, Vec3], ...] = ()  # up to two: capture time [ns], position [m]
     residuals_m: tuple[float, ...] = ()  # newest last, scaled to the noise of a single position
-    std_m: float = (
-        0.0  # standard deviation of a position, each axis [m]; 0 where it is not known, or not above `USUAL_STD_M`
-    )
+    # Standard deviation of a position, each axis [m]; 0 where it is not known, or not above `USUAL_STD_M`
+    std_m: float = 0.0
 
     @property
     def is_known(self) -> bool:

@@ -313,7 +313,7 @@ class BaselineSolver:
         for u in applied:
             states.append(problem.plant.a @ states[-1] + problem.plant.b @ u)
         target_states, target_inputs = problem.target[np.newaxis], problem.u_target[np.newaxis]
-        return replace(
+        return msgspec.structs.replace(
             make_answer(seq, self._name, problem, np.array(states), applied, target_states, target_inputs),
             inputs=inputs,
         )
