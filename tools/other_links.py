@@ -142,13 +142,21 @@ def fly(
         if k and adapts:
             ages = count_age(ages, before + 1, choice)
             variances = np.einsum("mi,ij,mj->m", rows, covs[age], rows)
-            risk = compute_outside_risk(sides - rows @ mean, variances, loop.widening if age < HORIZON else 1.0)
-            loop = charge_risk(loop, risk, ALLOWED, keeps_away=plan is not None and plan.offset > 0.0)
+            is_behind = age >= HORIZON
+            risk = compute_outside_risk(sides - rows @ mean, variances, 1.0 if is_behind else loop.widening)
+            keeps_away = plan is not None and plan.offset > 0.0
+            loop = charge_risk(loop, risk, ALLOWED, keeps_away=keeps_away, is_behind_horizon=is_behind)
         before = age
         if is_new and age < HORIZON:
             preview = Preview(age=age, cov=covs[age] if age else None)
             if adapts:
-                preview = Preview(age=age, cov=preview.cov, level=ages.level, widening=loop.widening)
+                preview = Preview(
+                    age=age,
+                    cov=preview.cov,
+                    level=ages.level,
+                    widening=loop.widening,
+                    silence_widening=loop.silence_widening,
+                )
             plan, begun = solver.solve(0, mean, target, preview), k
         if plan is not None and k - begun < HORIZON and age < HORIZON:
             inputs[k] = plan.inputs[k - begun]

@@ -413,6 +413,7 @@ class RiskRecord(Record, frozen=True, kw_only=True):
     level: int  # level of the budgets; 0: the certificate, which holds on any link
     contradicts: bool  # whether the link as observed contradicts the configured one
     widening: float  # factor of all standard deviations
+    silence_widening: float  # further factor of those at the end of a plan, for silences that outlast it
 
 
 class LinkEstimate(Record, frozen=True, kw_only=True):

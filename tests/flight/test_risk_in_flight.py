@@ -70,7 +70,8 @@ def test_a_replay_decides_the_same_with_the_same_risk(flight: tuple[list[StepInp
 def test_level_and_spread_follow_from_the_recorded_counts_alone(
     flight: tuple[list[StepInput], list[TickOutput]],
 ) -> None:
-    parameters = build_controller(load_room()).risk
+    controller = build_controller(load_room())
+    parameters, horizon = controller.risk, controller.horizon
     assert parameters is not None
     ages, loop = AgeRecord(), LoopState()
     plans: dict[str, float] = {}
@@ -79,8 +80,15 @@ def test_level_and_spread_follow_from_the_recorded_counts_alone(
         if risk is not None:
             keeps_away = plans.get("flown", 0.0) > 0.0
             ages = count_age(ages, risk.age, parameters.choice)
-            loop = charge_risk(loop, risk.outside, parameters.choice.allowed, keeps_away=keeps_away)
-            assert (risk.level, risk.contradicts, risk.widening) == (ages.level, ages.contradicts, loop.widening)
+            loop = charge_risk(
+                loop,
+                risk.outside,
+                parameters.choice.allowed,
+                keeps_away=keeps_away,
+                is_behind_horizon=risk.age > horizon,
+            )
+            assert (risk.level, risk.contradicts) == (ages.level, ages.contradicts)
+            assert (risk.widening, risk.silence_widening) == (loop.widening, loop.silence_widening)
         if output.plan is not None:
             plans["flown"] = output.plan.offset
     assert ages.steps > 0.9 * STEPS

@@ -26,7 +26,11 @@ def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | Non
     if parameters is None:
         return preview
     level = risk.ages.level if parameters.budgets == "observed" else CERTIFICATE_LEVEL
-    return msgspec.structs.replace(preview, level=level, widening=risk.loop.widening if parameters.adapts else 1.0)
+    if not parameters.adapts:
+        return msgspec.structs.replace(preview, level=level)
+    return msgspec.structs.replace(
+        preview, level=level, widening=risk.loop.widening, silence_widening=risk.loop.silence_widening
+    )
 
 
 def update_risk(
@@ -46,11 +50,21 @@ def update_risk(
         return RiskGroup(risk.ages, risk.loop, age_steps), None
     age = before + 1
     ages = count_age(risk.ages, age, parameters.choice)
-    outside = _find_outside_risk(risk, context, supervised, parameters, mission)
+    # Behind the horizon no plan keeps f times the deviation: with f there, a long silence would raise f without end.
+    is_behind_horizon = age_steps >= context.controller.horizon
+    widening = 1.0 if is_behind_horizon else risk.loop.widening
+    outside = _find_outside_risk(widening, context, supervised, parameters, mission)
     keeps_away = plan is not None and plan.offset > 0.0
-    loop = charge_risk(risk.loop, outside, parameters.choice.allowed, keeps_away=keeps_away)
+    loop = charge_risk(
+        risk.loop, outside, parameters.choice.allowed, keeps_away=keeps_away, is_behind_horizon=is_behind_horizon
+    )
     record = RiskRecord(
-        age=age, level=ages.level, contradicts=ages.contradicts, outside=outside, widening=loop.widening
+        age=age,
+        level=ages.level,
+        contradicts=ages.contradicts,
+        outside=outside,
+        widening=loop.widening,
+        silence_widening=loop.silence_widening,
     )
     return RiskGroup(ages, loop, age_steps), record
 
@@ -68,7 +82,7 @@ def report_saturation(before: RiskGroup, now: RiskGroup, context: TickContext) -
 
 
 def _find_outside_risk(
-    risk: RiskGroup,
+    widening: float,
     context: TickContext,
     supervised: Supervised,
     parameters: RiskParameters,
@@ -82,8 +96,4 @@ def _find_outside_risk(
     cov = select_covariance(kalman, belief)[:n_x, :n_x]
     # m = b - C x̂,  σ² = diag(C P C')
     margins = find_limits(context.controller.mission, mission, context.boundary_ns) - rows @ belief.mean[:n_x]
-    # Behind the horizon no plan keeps f times the deviation: with f there, a long silence would raise f without end.
-    age_steps = supervised.view.age_steps
-    is_planned = age_steps is not None and age_steps < context.controller.horizon
-    widening = risk.loop.widening if is_planned else 1.0
     return compute_outside_risk(margins, ((rows @ cov) * rows).sum(axis=1), widening)

@@ -57,6 +57,7 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
 
     level: int = CONFIGURED_LEVEL  # level of the budgets of the risk by age
     widening: float = 1.0  # factor of all standard deviations of the rows
+    silence_widening: float = 1.0  # further factor of those of information H steps old
 
     @property
     def nominal(self) -> bool:

@@ -115,7 +115,7 @@ def simulate_loop(risk_of_widening: float, steps: int) -> tuple[LoopState, float
     for _ in range(steps):
         risk = min(1.0, risk_of_widening / state.widening**3)
         total += risk
-        state = charge_risk(state, risk, ALLOWED, keeps_away=True)
+        state = charge_risk(state, risk, ALLOWED, keeps_away=True, is_behind_horizon=False)
     return state, total / steps
 
 
@@ -134,7 +134,7 @@ def test_any_sequence_of_risks_keeps_the_bound_of_the_mean_below_saturation() ->
         # The worst sequence: outside whenever the loop would not saturate by it
         risk = float(state.log_widening < 1.3 and rng.random() < 0.5)
         total += risk
-        state = charge_risk(state, risk, ALLOWED, keeps_away=True)
+        state = charge_risk(state, risk, ALLOWED, keeps_away=True, is_behind_horizon=False)
         assert not state.is_saturated
         assert total / step <= ALLOWED * (adaptation.TARGET + span / (adaptation.GAIN * step))
 
@@ -142,17 +142,41 @@ def test_any_sequence_of_risks_keeps_the_bound_of_the_mean_below_saturation() ->
 def test_the_loop_saturates_where_nothing_helps() -> None:
     state = LoopState()
     for _ in range(500):
-        state = charge_risk(state, 0.5, ALLOWED, keeps_away=True)
+        state = charge_risk(state, 0.5, ALLOWED, keeps_away=True, is_behind_horizon=False)
     assert state.is_saturated
     assert state.widening == adaptation.MAX_WIDENING
 
 
 def test_safe_steps_far_from_limits_lower_f_to_one_and_no_further() -> None:
-    state = charge_risk(LoopState(), 1.0, ALLOWED, keeps_away=False)
+    state = charge_risk(LoopState(), 1.0, ALLOWED, keeps_away=False, is_behind_horizon=False)
     assert state.widening > 1.0
     for _ in range(1000):
-        state = charge_risk(state, 0.0, ALLOWED, keeps_away=False)
+        state = charge_risk(state, 0.0, ALLOWED, keeps_away=False, is_behind_horizon=False)
     assert state.log_widening == 0.0
+
+
+def test_risk_in_a_silence_moves_the_end_of_plans_alone_and_is_forgotten_without_one() -> None:
+    begin = LoopState()
+    quiet = silent = begin
+    for _ in range(50):
+        quiet = charge_risk(quiet, 0.2, ALLOWED, keeps_away=True, is_behind_horizon=False)
+        silent = charge_risk(silent, 0.2, ALLOWED, keeps_away=True, is_behind_horizon=True)
+    assert quiet.widening == silent.widening
+    assert quiet.silence_widening < begin.silence_widening < silent.silence_widening
+    for _ in range(5000):
+        silent = charge_risk(silent, 0.0, ALLOWED, keeps_away=True, is_behind_horizon=True)
+    assert silent.silence_widening == 1.0
+
+
+def test_the_end_of_a_plan_alone_keeps_away_for_a_silence(solver: ConditionedSolver) -> None:
+    state, target, age = np.array([0.0, 0.0, 17.0, 0.0]), solver.problem.target, 2
+    near, far = (
+        solver.solve(0, state, target, Preview(level=0, age=age, silence_widening=factor)).backoff_x
+        for factor in (1.0, 2.0)
+    )
+    begins = len(near) - 1 - age
+    east = solver.problem.state_set.c[:, 2] > 0.0
+    assert (far[begins:, east] > 1.5 * near[begins:, east]).all()
 
 
 def test_a_wider_spread_keeps_further_away(solver: ConditionedSolver) -> None:

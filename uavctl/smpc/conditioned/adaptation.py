@@ -13,6 +13,10 @@
        log f <- log f + γ (r_k / α - 0.95)
 
    As long as f is within its bounds, the mean of r_k over T steps is at most α (0.95 + log(f_max / f_min) / (γ T)).
+4. *Silence.* Behind the horizon H no plan flies, and the spread grows on from where the last one ends. So the end of a
+   plan, of information H steps old, keeps a further factor g, with r_k counted where information is that old or older:
+
+       log g <- log g + γ (r_k / α - 0.5)
 
 All functions are pure: they depend on their arguments alone.
 """
@@ -52,6 +56,10 @@ TARGET = 0.95  # share of α that the loop controls to: the rest is for the nois
 GAIN = 0.002  # γ: an error of f falls to half in some 100 steps; 0.004 costs 6 % at a wall on the configured link
 FIRST_STEPS = 60.0  # k_0: the gain is 1 / (k_0 + k) while that is larger than γ, so the loop begins faster
 MIN_WIDENING = 0.75  # least f: a bound on what quiet steps alone may take from the back-offs
+# First g: the spread grows with the square root of time, so the end of a plan holds for a silence of 4 H steps. What is
+# learnt after the first silence comes too late on a link with long runs of losses
+FIRST_SILENCE_WIDENING = 2.0
+SILENCE_TARGET = 0.5  # share of α that ages behind the horizon may use: as much as those that plans fly in
 MAX_WIDENING = 4.0  # largest f: beyond it plans leave most of the room, and f tells more of a wrong model than of risk
 # Least divisor and least number of events: keeps divisions and quantiles of empty records finite
 TINY = 1e-300
@@ -152,6 +160,7 @@ class LoopState(msgspec.Struct, frozen=True):
 
     log_widening: float = 0.0  # log f
     steps: int = 0  # steps so far in which the plan kept away from a limit
+    log_silence_widening: float = math.log(FIRST_SILENCE_WIDENING)  # log g
 
     @property
     def widening(self) -> float:
@@ -159,26 +168,46 @@ class LoopState(msgspec.Struct, frozen=True):
         return round(math.exp(self.log_widening), 2)
 
     @property
+    def silence_widening(self) -> float:
+        """g, rounded as f."""
+        return round(math.exp(self.log_silence_widening), 2)
+
+    @property
     def is_saturated(self) -> bool:
         """Whether f is at its largest value: the loop cannot bring the risk down."""
         return self.log_widening >= math.log(MAX_WIDENING)
 
 
-def charge_risk(state: LoopState, risk: float, allowed: float, *, keeps_away: bool) -> LoopState:
+def charge_risk(
+    state: LoopState, risk: float, allowed: float, *, keeps_away: bool, is_behind_horizon: bool
+) -> LoopState:
     """Charge the risk of a step.
 
     Args:
         risk: Probability that the state of the step is outside, given all that is known in it.
         keeps_away: Whether the plan keeps away from a limit. Elsewhere nothing is saved for later.
+        is_behind_horizon: Whether the information of the step is H steps old or older.
     """
     # γ_k = max(γ, 1 / (k_0 + k))
-    change = max(GAIN, 1.0 / (FIRST_STEPS + state.steps)) * (risk / allowed - TARGET)
+    gain = max(GAIN, 1.0 / (FIRST_STEPS + state.steps))
+    change = gain * (risk / allowed - TARGET)
     if change < 0.0 and not keeps_away:
         change = max(change, -max(state.log_widening, 0.0))
     # A few steps inside are no evidence: f falls no lower than the last gain would have taken it.
     least = max(math.log(MIN_WIDENING), -GAIN * state.steps)
     log_widening = min(max(state.log_widening + change, least), math.log(MAX_WIDENING))
-    return LoopState(log_widening, state.steps + keeps_away)
+    log_silence_widening = state.log_silence_widening
+    if keeps_away:
+        log_silence_widening = _charge_silence(state, risk / allowed if is_behind_horizon else 0.0, gain)
+    return LoopState(log_widening, state.steps + keeps_away, log_silence_widening)
+
+
+def _charge_silence(state: LoopState, relative_risk: float, gain: float) -> float:
+    """Return log g after a step with the risk r_k / α behind the horizon."""
+    # Silences are rare: a larger gain would take g to 1 before the first one.
+    change = relative_risk - SILENCE_TARGET
+    log_widening = state.log_silence_widening + (GAIN if change < 0.0 else gain) * change
+    return min(max(log_widening, 0.0), math.log(MAX_WIDENING))
 
 
 def compute_outside_risk(margins: Array, variances: Array, widening: float) -> float:

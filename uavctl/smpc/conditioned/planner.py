@@ -236,7 +236,7 @@ class ConditionedSolver:
                 *self.levels,
             )
         self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
-        self._cached_backoffs: tuple[tuple[bool, int, int, float, bytes], _RowBackoffs] | None = None
+        self._cached_backoffs: tuple[tuple[bool, int, int, float, float, bytes], _RowBackoffs] | None = None
 
     def _make_level(self, near: _Allocation, transit: _Allocation, risk: AgeRisk, allowed: float) -> RiskLevel:
         """Make a level.
@@ -392,11 +392,13 @@ class ConditionedSolver:
         """
         in_transit = allocation is self.levels[preview.level].transit
         cov_bytes = b"" if preview.cov is None else preview.cov.tobytes()
-        key = in_transit, preview.level, preview.age, preview.widening, cov_bytes
+        key = in_transit, preview.level, preview.age, preview.widening, preview.silence_widening, cov_bytes
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             sigma, age = self._deviations.compute(preview.cov), preview.age
             if preview.widening != 1.0:
                 sigma = preview.widening * sigma
+            if preview.silence_widening != 1.0:
+                sigma[len(sigma) - 1 - age :] *= preview.silence_widening
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
             backoff = allocation.quantiles[age] * sigma
             self._cached_backoffs = (
