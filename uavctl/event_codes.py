@@ -69,6 +69,7 @@ class EventCode(StrEnum):
     # Link model
     LINK_BURSTS = "link-bursts"
     LINK_BELOW_DESIGN = "link-below-promise"
+    RISK_SATURATED = "risk-saturated"  # limits are left more often than allowed, and plans keep as far away as they may
     # Connections [connection]
     HUNG_UP = "hung-up"  # the other side has closed a TCP connection
     CONNECTION_SILENT = "went-silent"  # nothing came over a TCP connection any more

@@ -405,6 +405,17 @@ class Header(Record, frozen=True, kw_only=True):
     platform: str = ""  # operating system and processor
 
 
+class RiskRecord(Record, frozen=True, kw_only=True):
+    """Risk of the step that ends at a Δt boundary, and what the next plan is made with."""
+
+    age: int  # age of the information that moved the vehicle here [steps], from 1 on
+    outside: float  # probability that the vehicle is outside of its limits, given all that is known
+    level: int  # level of the budgets; 0: the certificate, which holds on any link
+    contradicts: bool  # whether the link as observed contradicts the configured one
+    widening: float  # factor of all standard deviations
+    silence_widening: float  # further factor of those at the end of a plan, for silences that outlast it
+
+
 class LinkEstimate(Record, frozen=True, kw_only=True):
     """Estimate of the link that carries the positions, at a Δt boundary."""
 
@@ -418,6 +429,7 @@ class LinkEstimate(Record, frozen=True, kw_only=True):
     bursts: bool
     promised: float  # least p that the design counts on
     below_promise: bool  # p is below `promised` with probability `credible` at least
+    risk: RiskRecord | None = None  # of the step; None without one, and in recordings of before
 
 
 class PolicyLibrary(Record, frozen=True, kw_only=True):

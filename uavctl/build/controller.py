@@ -28,6 +28,7 @@ from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.risk_state import RiskParameters
 from uavctl.flight.yaw import YawMode, YawParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
@@ -37,6 +38,7 @@ from uavctl.smpc.conditioned.planner import (
     ConditionedSolver,
     make_conditioned_id,
     make_conditioned_record,
+    make_level_choice,
 )
 from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
@@ -198,7 +200,15 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
     elif cov is None:
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
-    solver = ConditionedSolver(problem, link, max_risk, slew_mps3=slew_mps3, cov=cov, filter_plant=estimator_plant)
+    solver = ConditionedSolver(
+        problem,
+        link,
+        max_risk,
+        slew_mps3=slew_mps3,
+        cov=cov,
+        filter_plant=estimator_plant,
+        has_lower_levels=for_flight and config.risk.budgets != "configured",
+    )
     return ConditionedDesign(solver, cov, make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))
 
 
@@ -375,6 +385,15 @@ def _make_vec3(values: list[float]) -> Vec3:
     return north, east, down
 
 
+def _build_risk(config: Config, design: AnyDesign) -> RiskParameters | None:
+    """Build the parameters of the risk in flight; None where the budgets of the design fly as they are."""
+    risk = config.risk
+    if not isinstance(design, ConditionedDesign) or risk.budgets == "configured":
+        return None
+    choice = make_level_choice(design.solver, 1.0 - config.smpc.delta_x)
+    return RiskParameters(choice, design.state_set.c, risk.budgets, risk.adapt)
+
+
 def build_controller(config: Config, design: AnyDesign | None = None) -> Controller:
     """Build the controller: all constants of a control tick; the design is built if it is not given.
 
@@ -394,6 +413,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
         names=build_names(design),
         link=LinkEstimateParameters(promised=_compute_min_probability(config)),
         outside=outside,
+        risk=_build_risk(config, design),
         late_steps=design.horizon if outside or isinstance(design, ConditionedDesign) else len(design.late),
         envelope=build_envelope(config, plant),
         yaw=YawParameters(

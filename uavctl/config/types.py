@@ -328,6 +328,23 @@ class RiskConfig(Section, frozen=True, kw_only=True):
             "estimate that positions alone give, with the covariance of its error in every back-off of a state"
         ),
     ] = "exact"
+    budgets: Annotated[
+        Literal["certificate", "observed", "configured"],
+        Meta(
+            description="risk of each age of information, with scheme `age-conditioned`: `configured` holds on a link "
+            "as in `[link]` alone; `certificate` holds on any link, further away from limits; `observed`, which is "
+            "new, begins as `certificate` and gives more to rare ages as far as the link in flight agrees with "
+            "`[link]`; measured in simulation only (docs/campaigns.md): on worse links it keeps the promise, at two "
+            "to four times the cost of a step"
+        ),
+    ] = "configured"
+    adapt: Annotated[
+        bool,
+        Meta(
+            description="keep further away from limits in flight while they are left more often than allowed, and "
+            "nearer while less often, with `risk.budgets` `certificate` or `observed`"
+        ),
+    ] = True
 
 
 class SolverConfig(Section, frozen=True, kw_only=True):

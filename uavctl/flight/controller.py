@@ -14,6 +14,7 @@ from uavctl.flight.mission import Mission
 from uavctl.flight.monitors.external import make_braking
 from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.outliers import GateParameters, Reach, make_reach
+from uavctl.flight.risk_state import RiskParameters
 from uavctl.flight.yaw import HELD_YAW, YawParameters
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.braking import Braking
@@ -47,6 +48,7 @@ class Controller:
     # Least and largest input (n_u,) that may be sent, bias included; None: those of the design
     input_bounds: tuple[Array, Array] | None = None
     yaw: YawParameters = HELD_YAW  # parameters of the yaw setpoint
+    risk: RiskParameters | None = None  # parameters of the risk; None: the design's budgets fly
     envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: no monitor of motion runs
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others

@@ -37,6 +37,7 @@ from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_w
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
+from uavctl.flight.risk import set_risk
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
 from uavctl.flight.supervise import Supervised, are_positions_lost, observe_velocity
@@ -289,9 +290,9 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
     controller = phase.controller
     # u = u_sent + d: the solver counts what acts on the plant in all
     sent = controller.plant.to_input(phase.state.plan.sent_mps2)
-    return Preview(
-        limits=preview.limits,
-        path=preview.path,
+    preview = set_risk(preview, phase.state.risk, controller.risk)
+    return msgspec.structs.replace(
+        preview,
         age=min(phase.view.age_steps or 0, controller.late_steps),
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,

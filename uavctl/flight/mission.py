@@ -243,6 +243,12 @@ def _find_row(mission: Mission, state: MissionState, at_ns: int, trajectory: Tra
     return min((at_ns - state.start_ns - state.paused_ns) // mission.dt_ns, len(trajectory.states) - 1)
 
 
+def find_limits(mission: Mission, state: MissionState | None, at_ns: int) -> Array:
+    """Find the right sides (m_x,) of the state rows at a time."""
+    moving = None if state is None else _compute_limits(mission, at_ns - state.start_ns)
+    return mission.limits if moving is None else moving[0]
+
+
 def _compute_limits(mission: Mission, since_ns: int) -> Array | None:
     """Compute the right sides of the state rows in stages 0 … H (H+1, m_x); None where no fence is closer."""
     if not mission.fences:

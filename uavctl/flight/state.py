@@ -18,6 +18,7 @@ from uavctl.flight.monitors.jumps import JumpTrack
 from uavctl.flight.monitors.noise import NoiseTrack
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.verdict import Verdict
+from uavctl.flight.risk_state import RiskGroup
 from uavctl.records import Command, ControlMode, Plan, Vec3
 
 
@@ -113,6 +114,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     plan: PlanGroup = PlanGroup()
     fallback: FallbackGroup = FallbackGroup()
     alarms: AlarmGroup = AlarmGroup()
+    risk: RiskGroup = RiskGroup()
 
     @property
     def mode(self) -> ControlMode:

@@ -20,6 +20,10 @@ INPUT_TOLERANCE = 1e-6
 KEPT_TOLERANCE = 1e-6
 
 
+CERTIFICATE_LEVEL = 0  # level of the budgets of the risk that holds on any link
+CONFIGURED_LEVEL = -1  # level of the budgets of the risk that is made for the configured link
+
+
 class QuestionError(ValueError):
     """A question that cannot be answered: its age or its covariance cannot be."""
 
@@ -50,6 +54,10 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
 
     sent_mps2: Array | None = None  # acceleration setpoint that acts until then (n_axes,), without biases
     braking: Braking | None = None  # braking of the fallback, for a controller that nothing keeps from the limits
+
+    level: int = CONFIGURED_LEVEL  # level of the budgets of the risk by age
+    widening: float = 1.0  # factor of all standard deviations of the rows
+    silence_widening: float = 1.0  # further factor of those of information H steps old
 
     @property
     def nominal(self) -> bool:

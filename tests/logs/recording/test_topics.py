@@ -22,6 +22,7 @@ def test_every_recorded_type_has_one_topic() -> None:
         "Outgoing",
         "VehicleMotion",
         "InertialSample",
+        "RiskRecord",
     }
     types = {
         name

@@ -63,7 +63,12 @@ class AgeRisk:
 
 
 def allocate_by_age(
-    link: AgeModel, deviations: Array, allowed: float, exponent: float = AGE_EXPONENT, n_binding: int = 1
+    link: AgeModel,
+    deviations: Array,
+    allowed: float,
+    exponent: float = AGE_EXPONENT,
+    n_binding: int = 1,
+    max_budget: float = 1.0,
 ) -> AgeRisk:
     """Allocate the allowed risk so that Σ_t π_t^h β_t is least where n equal rows bind, β_t = Φ⁻¹(1 - ε̄_t / n) σ_t.
 
@@ -75,13 +80,14 @@ def allocate_by_age(
         allowed: 1 - δ_x.
         exponent: h.
         n_binding: n, the number of rows that may bind together.
+        max_budget: Largest budget of an age, more than 1 - δ_x.
 
     Raises:
         DesignError: Information is older than the horizon more often than allowed.
     """
     steps = len(deviations)
     weights, older_probability, remaining = _compute_age_probabilities(link, steps, allowed)
-    max_budget = min(1.0, n_binding * MAX_RISK)
+    max_budget = min(max_budget, n_binding * MAX_RISK)
     if not deviations.all():
         return AgeRisk(weights, older_probability, np.full(steps, min(remaining / weights.sum(), max_budget)))
     # Stationary: π_t φ(κ_t) / σ_t = λ π_t^h, so κ_t² = 2 log(π_t^(1-h) / (λ σ_t)) where that is positive.

@@ -42,6 +42,7 @@ from uavctl.smpc.answer import (
     is_finite,
 )
 from uavctl.smpc.batch import Decisions, gather_answers
+from uavctl.smpc.conditioned.adaptation import LevelChoice
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
     DISTANT_SHARE,
@@ -62,7 +63,7 @@ from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant, digest
 from uavctl.smpc.qp import OPEN
-from uavctl.smpc.sets import Polytope, find_equilibria
+from uavctl.smpc.sets import Polytope, find_equilibria, find_pairs
 
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design
@@ -72,6 +73,9 @@ METHOD = "age-conditioned"
 ROUNDS = 2  # rounds of an allocation
 # Rounds if the plan does not keep its back-offs: half of the plans between two near walls need the third.
 MAX_ROUNDS = 3
+# Largest budget of an age at each level between the certificate and the configured link, as a multiple of the allowed
+# risk: steps of a factor of at most two, so that a record frees risk gradually
+MAX_BUDGET_FACTORS = (1.25, 1.6, 2.5, 5.0)
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
@@ -94,6 +98,18 @@ class _Allocation:
     distant_quantiles: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
     # Distance of the reference from each row (n, m), by the number of rows that limit a target
     reference_backoffs: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RiskLevel:
+    """Allocations of one level of the budgets. Level 0 is the certificate, the last one that of the configured link."""
+
+    near: _Allocation  # beside limits and along motions
+    transit: _Allocation  # where the target is far from all limits
+    far: Array  # distance (m,) of a target from each row beyond which it is far from it
+    # Without limits of a preview and widening: bounds on a target far from limits, and on one that needs no reference
+    transit_bounds: Array
+    target_bounds: Array
 
 
 class _Rest(msgspec.Struct, frozen=True, eq=False):
@@ -127,6 +143,7 @@ class ConditionedSolver:
         slew_mps3: Largest change of the acceleration setpoint in a second [m/s³], see `SlewRows`; infinite: no limit.
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
+        has_lower_levels: Whether there are levels of the budgets below that of the configured link.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
@@ -142,6 +159,8 @@ class ConditionedSolver:
         slew_mps3: float = math.inf,
         cov: Array | None = None,
         filter_plant: Plant | None = None,
+        *,
+        has_lower_levels: bool = False,
     ) -> None:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
@@ -197,31 +216,57 @@ class ConditionedSolver:
                 reference_backoffs,
             )
 
-        self._near = make_allocation(
-            allocate_by_age(link, self._select_position_deviations(), allowed, exponent, n_parts)
-        )
-        self._transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
+        deviations = self._select_position_deviations()
+        near = make_allocation(allocate_by_age(link, deviations, allowed, exponent, n_parts))
+        transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
+        self.levels: tuple[RiskLevel, ...] = (self._make_level(near, transit, transit.risk, allowed),)
+        if has_lower_levels:
+            # Where a target is far from all limits, limits matter in transit only, and all levels share one allocation.
+            is_possible = np.arange(steps) < self._count_possible_ages(cov, allowed)
+            certificate = AgeRisk(transit.risk.age_probabilities, 0.0, np.full(steps, allowed))
+            bounded = (
+                allocate_by_age(link, deviations, allowed, exponent, n_parts, factor * allowed)
+                for factor in MAX_BUDGET_FACTORS
+            )
+            lower = (
+                replace(risk, budgets=np.where(is_possible, risk.budgets, 1.0)) for risk in (certificate, *bounded)
+            )
+            self.levels = (
+                *(self._make_level(make_allocation(risk), transit, risk, allowed) for risk in lower),
+                *self.levels,
+            )
+        self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
+        self._cached_backoffs: tuple[tuple[bool, int, int, float, float, bytes], _RowBackoffs] | None = None
+
+    def _make_level(self, near: _Allocation, transit: _Allocation, risk: AgeRisk, allowed: float) -> RiskLevel:
+        """Make a level.
+
+        Args:
+            risk: Risk by age whose oldest age with a back-off decides which targets are far from limits.
+        """
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
-        counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
+        counts = int(np.count_nonzero(risk.budgets < 1.0))
         oldest = self._deviations.compute(None)[max(0, counts - 1)]
-        self._far = np.maximum(
-            self._transit.reference_backoffs[-1], float(compute_quantile(np.array(allowed / n_parts))) * oldest
+        far = np.maximum(
+            transit.reference_backoffs[-1], float(compute_quantile(np.array(allowed / len(self._parts)))) * oldest
         )
-        # Without limits of a preview: bounds on a target far from limits, and on one that needs no reference
-        self._transit_bounds = (self._b - self._far)[self._reference_rows]
-        self._target_bounds = (self._b - self._near.reference_backoffs[0])[self._reference_rows]
-        self._cached_rest: tuple[bytes, _Rest] | None = None
-        self._cached_backoffs: tuple[tuple[bool, int, bytes], _RowBackoffs] | None = None
+        return RiskLevel(
+            near,
+            transit,
+            far,
+            transit_bounds=(self._b - far)[self._reference_rows],
+            target_bounds=(self._b - near.reference_backoffs[0])[self._reference_rows],
+        )
 
     @property
     def risk(self) -> AgeRisk:
         """Risk by age near limits and along motions."""
-        return self._near.risk
+        return self.levels[-1].near.risk
 
     @property
     def transit_risk(self) -> AgeRisk:
         """Risk by age where the target is far from all limits."""
-        return self._transit.risk
+        return self.levels[-1].transit.risk
 
     def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
@@ -232,7 +277,7 @@ class ConditionedSolver:
     def compute_reference_limits(self) -> Array:
         """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self._near.reference_backoffs[-1]
+        sides[self._rows] -= self.levels[-1].near.reference_backoffs[-1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
@@ -300,7 +345,7 @@ class ConditionedSolver:
         """Find where a plan rests; that of the last target is kept, by its bits, without limits or a path."""
         if preview.limits is not None or preview.path is not None:
             return self._make_rest(target, preview)
-        key = target.tobytes()
+        key = preview.level, preview.widening, target.tobytes()
         if self._cached_rest is None or self._cached_rest[0] != key:
             self._cached_rest = key, self._make_rest(target, preview)
         return self._cached_rest[1]
@@ -308,7 +353,7 @@ class ConditionedSolver:
     def _make_rest(self, target: Array, preview: Preview) -> _Rest:
         held, limits = self._equilibria.held, self._select_limits(preview)
         target_rows = self._equilibrium_rows.dot(target[held])
-        reference = self._find_reference(target, target_rows, limits)
+        reference = self._find_reference(target, target_rows, limits, preview)
         return _Rest(
             allocation=self._select_allocation(target_rows, limits, preview),
             reference=reference,
@@ -330,12 +375,14 @@ class ConditionedSolver:
         Args:
             target_rows: Values of the rows of resting places at the target.
         """
+        level = self.levels[preview.level]
         if preview.path is not None:
-            return self._near
-        kept = self._transit_bounds
-        if limits is not self._b:
-            kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._reference_rows]
-        return self._transit if np.count_nonzero(target_rows <= kept) == kept.size else self._near
+            return level.near
+        kept = level.transit_bounds
+        if limits is not self._b or preview.widening != 1.0:
+            sides = limits if limits.ndim == 1 else limits.min(axis=0)
+            kept = (sides - preview.widening * level.far)[self._reference_rows]
+        return level.transit if np.count_nonzero(target_rows <= kept) == kept.size else level.near
 
     def _find_row_backoffs(self, allocation: _Allocation, preview: Preview) -> _RowBackoffs:
         """Return the first back-offs of a plan from a position of age a; the last ones are cached, by their bits.
@@ -343,9 +390,15 @@ class ConditionedSolver:
         The age acts twice. It selects the budget of each stage, as stage t has information a + t steps old. And the
         covariance P of the estimate, from which σ_ti follows, has grown since the position.
         """
-        key = allocation is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
+        in_transit = allocation is self.levels[preview.level].transit
+        cov_bytes = b"" if preview.cov is None else preview.cov.tobytes()
+        key = in_transit, preview.level, preview.age, preview.widening, preview.silence_widening, cov_bytes
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             sigma, age = self._deviations.compute(preview.cov), preview.age
+            if preview.widening != 1.0:
+                sigma = preview.widening * sigma
+            if preview.silence_widening != 1.0:
+                sigma[len(sigma) - 1 - age :] *= preview.silence_widening
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
             backoff = allocation.quantiles[age] * sigma
             self._cached_backoffs = (
@@ -354,19 +407,37 @@ class ConditionedSolver:
             )
         return self._cached_backoffs[1]
 
-    def _find_reference(self, target: Array, target_rows: Array, limits: Array) -> Array:
+    def _find_reference(self, target: Array, target_rows: Array, limits: Array, preview: Preview) -> Array:
         """Return the equilibrium (n_x,) nearest to the target; the rows that limit it share the budgets."""
-        sides, kept = limits, self._target_bounds
-        if limits is not self._b:
+        level = self.levels[preview.level]
+        backoffs, sides, kept = level.near.reference_backoffs, limits, level.target_bounds
+        if limits is not self._b or preview.widening != 1.0:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
-            kept = (sides - self._near.reference_backoffs[0])[self._reference_rows]
+            kept = (sides - preview.widening * backoffs[0])[self._reference_rows]
         reference, count = np.array(target), np.count_nonzero(target_rows > kept)
         if not count:
             return reference
-        distance = self._near.reference_backoffs[min(int(count), len(self._parts)) - 1]
+        distance = backoffs[min(int(count), len(self._parts)) - 1]
+        if preview.widening != 1.0:
+            distance = preview.widening * distance
         for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
+
+    def _count_possible_ages(self, cov: Array | None, allowed: float) -> int:
+        """Count the ages at which all rows can keep an equal share of the allowed risk between opposite limits.
+
+        At older ages the certificate keeps nothing back: no plan could.
+        """
+        sigma = self._deviations.compute(cov)
+        needed = float(compute_quantile(np.array(allowed / max(1, self._rows.size)))) * sigma
+        # β_ti + β_tj <= b_i + b_j for c_i = -c_j
+        is_possible = np.ones(len(sigma), dtype=np.bool_)
+        for pair in find_pairs(self._c):
+            if len(pair.sides) == 2:  # opposite limits
+                rows = [row for _, row in pair.sides]
+                is_possible &= needed[:, rows].sum(axis=1) <= self._b[rows].sum()
+        return int(np.logical_and.accumulate(is_possible).sum())
 
     def _select_position_deviations(self) -> Array:
         """Return the deviations (H,) for the allocation to the ages: those of the position with the largest one."""
@@ -617,3 +688,16 @@ def make_conditioned_record(design: ConditionedDesign) -> dict[str, object]:
         "slack_linear": problem.slack_linear,
         "slack_quadratic": problem.slack_quadratic,
     }
+
+
+def make_level_choice(solver: ConditionedSolver, allowed: float) -> LevelChoice:
+    """Make the data by which a level of the budgets is chosen.
+
+    Args:
+        allowed: 1 - δ_x.
+    """
+    risk = solver.risk
+    budgets = np.array([level.near.risk.budgets for level in solver.levels])
+    # What is older than the horizon counts in full; the certificate knows no link, and promises nothing of it.
+    older = np.append(allowed, np.ones(len(budgets) - 1))[:, None]
+    return LevelChoice(allowed, np.append(risk.age_probabilities, risk.older_probability), np.hstack([budgets, older]))

@@ -1,0 +1,137 @@
+"""Risk in flight: preset `room` beside a wall over a link in bursts; counts, level and spread are recorded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from flight_rig import MS, START_NS, run, sample, vehicle
+
+from uavctl.build.controller import build_conditioned, build_controller
+from uavctl.config.load import dump_config, load_config, parse_recorded
+from uavctl.config.types import Config
+from uavctl.event_codes import EventCode
+from uavctl.flight.context import locate_on_grid
+from uavctl.flight.risk import report_saturation
+from uavctl.flight.risk_state import RiskGroup
+from uavctl.flight.state import ControlState
+from uavctl.flight.tick import TickOutput, make_initial_state
+from uavctl.flight.tick import tick as run_tick
+from uavctl.records import RiskRecord, StepInput
+from uavctl.smpc.conditioned.adaptation import MAX_WIDENING, AgeRecord, LoopState, charge_risk, count_age
+
+STEPS = 300
+WALL_M = 3.0
+
+
+def load_room(*overrides: str) -> Config:
+    return load_config("room", ["target.position_m=[2.9, 0, -1.2]", "risk.budgets=observed", *overrides])
+
+
+def fly(config: Config, seed: int) -> tuple[list[StepInput], list[TickOutput]]:
+    """Fly from 0.5 m beside the target, with runs of five lost positions in the mean."""
+    controller, rng = build_controller(config), np.random.default_rng(seed)
+    plant, state, inputs, outputs = controller.plant, make_initial_state(), [], []
+    x, is_bad = plant.equilibrium((2.4, 0.0, -1.2)), False
+    waiting = []
+    for tick in range(STEPS):
+        at_ns = START_NS + tick * controller.tick_ns
+        is_bad = bool(rng.random() < (0.8 if is_bad else 0.1))
+        if not is_bad:
+            position = x[list(plant.position_index)] + rng.normal(scale=0.003, size=3)
+            waiting.append(sample(at_ns + MS, at_ns + 40 * MS, tuple(position.tolist())))
+        arrived = tuple(one for one in waiting if one.received_ns <= at_ns)
+        waiting = [one for one in waiting if one.received_ns > at_ns]
+        inputs.append(StepInput(tick=tick, at_ns=at_ns, samples=arrived, vehicle=vehicle()))
+        state, output = run_tick(state, inputs[-1], controller)
+        outputs.append(output)
+        u = np.zeros(plant.n_u) if output.setpoint is None else plant.to_input(output.setpoint.accel_mps2)
+        w = rng.multivariate_normal(np.zeros(plant.n_w), plant.w)
+        x = plant.a @ x + plant.b @ u + plant.e @ w
+    return inputs, outputs
+
+
+def list_risks(outputs: list[TickOutput]) -> list[RiskRecord]:
+    return [output.link.risk for output in outputs if output.link is not None and output.link.risk is not None]
+
+
+@pytest.fixture(scope="module")
+def flight() -> tuple[list[StepInput], list[TickOutput]]:
+    return fly(load_room(), 1)
+
+
+def test_a_replay_decides_the_same_with_the_same_risk(flight: tuple[list[StepInput], list[TickOutput]]) -> None:
+    inputs, outputs = flight
+    assert run(build_controller(load_room()), inputs) == outputs
+    assert len(list_risks(outputs)) > 0.9 * STEPS
+
+
+def test_level_and_spread_follow_from_the_recorded_counts_alone(
+    flight: tuple[list[StepInput], list[TickOutput]],
+) -> None:
+    controller = build_controller(load_room())
+    parameters, horizon = controller.risk, controller.horizon
+    assert parameters is not None
+    ages, loop = AgeRecord(), LoopState()
+    plans: dict[str, float] = {}
+    for output in flight[1]:
+        risk = None if output.link is None else output.link.risk
+        if risk is not None:
+            keeps_away = plans.get("flown", 0.0) > 0.0
+            ages = count_age(ages, risk.age, parameters.choice)
+            loop = charge_risk(
+                loop,
+                risk.outside,
+                parameters.choice.allowed,
+                keeps_away=keeps_away,
+                is_behind_horizon=risk.age > horizon,
+            )
+            assert (risk.level, risk.contradicts) == (ages.level, ages.contradicts)
+            assert (risk.widening, risk.silence_widening) == (loop.widening, loop.silence_widening)
+        if output.plan is not None:
+            plans["flown"] = output.plan.offset
+    assert ages.steps > 0.9 * STEPS
+
+
+def test_bursts_contradict_the_configured_link_and_its_budgets_do_not_fly(
+    flight: tuple[list[StepInput], list[TickOutput]],
+) -> None:
+    risks, parameters = list_risks(flight[1]), build_controller(load_room()).risk
+    assert parameters is not None
+    assert risks[-1].contradicts
+    ages = np.minimum([risk.age for risk in risks], parameters.choice.budgets.shape[1]) - 1
+    spent = parameters.choice.budgets[[risk.level for risk in risks], ages]
+    assert spent[200:].mean() <= 0.05 * 1.001
+    assert parameters.choice.budgets[-1][ages[200:]].mean() > 0.05
+
+
+def test_the_certificate_keeps_further_from_the_wall_in_silence_than_the_configured_link() -> None:
+    """The oldest stages of the plans have no back-off where the configured link calls their ages rare."""
+
+    def mean_distance_m(*overrides: str) -> float:
+        _, outputs = fly(load_room("risk.adapt=false", *overrides), 2)
+        return float(np.mean([WALL_M - output.plan.states[-1][0] for output in outputs if output.plan is not None]))
+
+    assert mean_distance_m("risk.budgets=certificate") > 1.2 * mean_distance_m("risk.budgets=configured")
+
+
+def test_by_default_and_in_recordings_of_before_the_budgets_are_the_configured_ones() -> None:
+    config = load_config("room")
+    design = build_conditioned(config)
+    assert build_controller(config, design).risk is None
+    assert len(design.solver.levels) == 1
+    text = "\n".join(
+        line for line in dump_config(load_room()).splitlines() if not line.startswith(("adapt =", "budgets ="))
+    )
+    assert parse_recorded(text, "recording").config.risk == config.risk
+
+
+def test_saturation_is_an_event_when_it_begins() -> None:
+    controller = build_controller(load_room())
+    given = StepInput(tick=0, at_ns=START_NS, samples=(), vehicle=vehicle())
+    context = locate_on_grid(ControlState(), given, controller, is_climbing_or_landing=False)
+    below, at = RiskGroup(), RiskGroup(loop=LoopState(math.log(MAX_WIDENING)))
+    assert [event.code for event in report_saturation(below, at, context)] == [EventCode.RISK_SATURATED]
+    assert not report_saturation(at, at, context)
+    assert not report_saturation(at, below, context)

@@ -1,0 +1,28 @@
+"""State and parameters of the risk in flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+
+from uavctl.arrays import Array
+from uavctl.smpc.conditioned.adaptation import AgeRecord, LevelChoice, LoopState
+
+
+@dataclass(frozen=True, eq=False)
+class RiskParameters:
+    """Parameters of the risk in flight."""
+
+    choice: LevelChoice  # what the level is chosen by
+    rows: Array  # state rows C (m, n_x)
+    budgets: str  # `certificate`, or `observed`: the level follows the link
+    adapts: bool  # whether the spread follows the risk as observed
+
+
+class RiskGroup(msgspec.Struct, frozen=True):
+    """State of the risk."""
+
+    ages: AgeRecord = AgeRecord()  # record of the ages
+    loop: LoopState = LoopState()  # state of the loop
+    age_steps: int | None = None  # age of the newest position at the last boundary; None before the first
