@@ -17,6 +17,7 @@ from uavctl.build.controller import compute_reference_limits
 from uavctl.build.mission import compute_reference_range
 from uavctl.config import Config
 from uavctl.config.mission import FenceConfig, MissionConfig
+from uavctl.config.types import CostConfig
 from uavctl.errors import UsageError
 from uavctl.lab.trial import get_room_limits
 from uavctl.records import Vec3
@@ -35,6 +36,9 @@ PAUSE_S = 0.5  # at a waypoint: the vehicle stops, which shows its braking
 HOLD_S = 20.0  # at the end, to measure how well the position is held
 SETTLING_S = 5.0  # part of HOLD_S that does not count
 ACCEPT_M = 0.15
+# Least cost of an input, as a share of the largest one of a state. The vehicle's answer is not known yet: with cheaper
+# inputs one that comes 0.15 s later than the plant's leaves the box where this one is still caught.
+MIN_INPUT_COST_SHARE = 0.03
 _DURATION_FACTOR = 1.2  # over the shortest time within the limits, which plans do not use fully
 _ARRIVAL_S = 0.5  # extra time to arrive at a waypoint
 
@@ -110,11 +114,18 @@ def add_excitation(config: Config, design: AnyDesign, box: SafeBox, *, lands: bo
     )
     return msgspec.structs.replace(
         config,
+        cost=_make_cautious_cost(config.cost),
         mission=mission,
         fence=tuple(_make_fences(config, box)),
         target=msgspec.structs.replace(config.target, position_m=centre),
         duration_s=float(math.ceil(duration_s)),
     )
+
+
+def _make_cautious_cost(cost: CostConfig) -> CostConfig:
+    """Return the weights with inputs that are not cheap."""
+    least = MIN_INPUT_COST_SHARE * max(cost.state)
+    return msgspec.structs.replace(cost, input=tuple(max(weight, least) for weight in cost.input))
 
 
 def check_start(
