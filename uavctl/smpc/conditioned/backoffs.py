@@ -264,10 +264,12 @@ class RowDeviations:
                 error = (self._cov_maps @ cov.ravel().take(self._entries))[:, :, 0]
             # 0 <= c'A^t P A^t'c <= σ_max², but for rounding
             least, most = float(error.min(initial=0.0)), float(error.max(initial=0.0))
-            if not (least >= -ROUNDING * np.abs(cov).max(initial=0.0) and most <= MAX_VARIANCE):
+            is_least_kept = least == 0.0 or least >= -ROUNDING * np.abs(cov).max(initial=0.0)
+            if not (is_least_kept and most <= MAX_VARIANCE):
                 raise QuestionError(f"a covariance with variances of {least:.3g} to {most:.3g} along the limits")
             variance = variance + error
-            np.maximum(variance, 0.0, out=variance)
+            if least < 0.0:
+                np.maximum(variance, 0.0, out=variance)
         return np.sqrt(variance).ravel().take(self._places)
 
 
