@@ -16,7 +16,7 @@ False alarms (docs/soak.md): 0 of 200 missions, with a bound of 0.255 m/s. The l
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from operator import itemgetter
 
@@ -150,10 +150,23 @@ def _find_return(
     if not before or not offsets or observation.motion.resumed_ns != observation.at_ns:
         return None
     (then_ns, then), (at_ns, now) = before[-1], offsets[-1]
-    s, off = (at_ns - then_ns) * 1e-9, [b - a for a, b in zip(then, now, strict=True)]
+    path = observation.motion.vehicle_path
+    step_then, step_now = _find_step(path, then_ns), _find_step(path, at_ns)
+    # The way is a sum Σ Δt v_k of ticks: the trapezoidal rule takes off ½ (Δt v_1 - Δt v_0).
+    steps = zip(step_then, step_now, strict=True)
+    s, half = (at_ns - then_ns) * 1e-9, [0.5 * (last - first) for first, last in steps]
+    off = [b - a + h for a, b, h in zip(then, now, half, strict=True)]
     # |o - o_0| > (0.8 s + 0.12 1/s t²) v_max
     bound_m = (RETURN_S + RETURN_1PS * s * s) * observation.parameters.disagreement_mps
     return (s, off) if math.hypot(*off) > bound_m else None
+
+
+def _find_step(path: tuple[tuple[int, Vector], ...], at_ns: int) -> Vector:
+    """Find the distance (3,) [m] that the vehicle flew in the tick of a time, by its own velocity; zero if unknown."""
+    after = bisect_left(path, at_ns, key=_TIME)
+    if not 0 < after < len(path):
+        return ZERO
+    return tuple(_subtract(path[after][1], path[after - 1][1]))
 
 
 def _find_drift(
