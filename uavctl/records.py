@@ -1,8 +1,8 @@
 """Records that cross module borders, their names as people read them, and the protocols that join the modules.
 
 SI units; positions in local NED; times are integer nanoseconds on our monotonic clock.
-Every record is frozen and made of plain numbers, so that it can be compared bit for bit,
-written to a recording and read back without loss.
+Every record is frozen and made of plain numbers; a plan has arrays, too. It can be compared bit for bit, written to a
+recording and read back without loss.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from functools import cache
 from typing import NamedTuple, Protocol
 
 import msgspec
+import numpy as np
+
+from uavctl.arrays import Array
 
 Vec3 = tuple[float, float, float]
 Vector = tuple[float, ...]
@@ -98,18 +101,20 @@ class GaveWay(Record, frozen=True, kw_only=True):
     amount: float  # in the row's, or the state's, unit; m/s² for "slew"
 
 
-class Plan(Record, frozen=True, kw_only=True):
+class Plan(Record, frozen=True, kw_only=True, eq=False):
     """An answer of the predictive controller, from `base_ns` on (one row a step Δt)."""
+
+    # Its matrices stay arrays: to turn their 1,461 numbers into tuples takes a twentieth of a tick.
 
     seq: int  # number of the step that asked for it
     base_ns: int
     captured_ns: int
     status: SolveStatus
     method: str
-    inputs: Matrix  # (H, n_u), in the plant's input units
-    states: Matrix  # (H+1, n_x), predicted mean
-    backoff_x: Matrix  # (H+1, rows of the state set)
-    backoff_u: Matrix  # (H, rows of the input set)
+    inputs: Array  # (H, n_u), in the plant's input units
+    states: Array  # (H+1, n_x), predicted mean
+    backoff_x: Array  # (H+1, rows of the state set)
+    backoff_u: Array  # (H, rows of the input set)
     reference: Vector  # (n_x,), the equilibrium that the plan ends in
     slack: float  # sum of all state-constraint slacks: what gave way
     offset: float  # l1 distance of the reference from the target
@@ -124,6 +129,17 @@ class Plan(Record, frozen=True, kw_only=True):
     # CRC-32 of the exact inputs, states, backoff_x and backoff_u, as doubles row by row; they are rounded here. None:
     # they are exact
     exact_crc32: int | None = None
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether all fields are equal, and all entries of the matrices."""
+        if not isinstance(other, Plan):
+            return NotImplemented
+        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__struct_fields__)
+        return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
+
+    def __hash__(self) -> int:
+        """Return a hash of what names a plan."""
+        return hash((self.seq, self.base_ns, self.design_id))
 
 
 class Setpoint(Record, frozen=True, kw_only=True):

@@ -23,7 +23,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from logs.recording.design_view import Box, DesignView
 from uavctl.arrays import Array
-from uavctl.records import Decision, Estimate, LinkStats, Matrix, Plan, Record, Setpoint, Timing, Truth
+from uavctl.records import Decision, Estimate, LinkStats, Plan, Record, Setpoint, Timing, Truth
 
 PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
 
@@ -216,9 +216,9 @@ def _get_limits(box: Box, axes: tuple[str, ...], index: tuple[int, ...]) -> tupl
     return lower, upper
 
 
-def tighten_limits(design: DesignView, backoff: Matrix, stage: int) -> tuple[Array, Array]:
+def tighten_limits(design: DesignView, backoff: Array, stage: int) -> tuple[Array, Array]:
     """Return the state limits less the back-offs of a stage: lower and upper (n_x,)."""
-    lower, upper, kept = design.state_box.lower.copy(), design.state_box.upper.copy(), backoff[stage]
+    lower, upper, kept = design.state_box.lower.copy(), design.state_box.upper.copy(), backoff[stage].tolist()
     for side, closed in zip((lower, upper), design.closed_sides, strict=True):
         for state, row, size in closed:
             side[state] -= kept[row] / size

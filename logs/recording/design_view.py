@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from operator import itemgetter
 from typing import Self
 
 import msgspec
@@ -83,15 +82,10 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
             position[AXIS_NUMBER[axis]] = float(state[index])
         return (position[0], position[1], position[2])
 
-    def positions_of(self, states: Matrix | Array) -> Array:
+    def positions_of(self, states: Array) -> Array:
         """Return the positions in many states (n, n_x), local NED (n, 3) [m]."""
         positions = np.zeros((len(states), 3))
-        if isinstance(states, np.ndarray):
-            positions[:, self._columns] = states[:, self.position_index]
-        elif len(self.position_index) > 1:  # to turn all of a plan's numbers into an array takes longer
-            positions[:, self._columns] = list(map(itemgetter(*self.position_index), states))
-        else:
-            positions[:, self._columns] = [[state[index] for index in self.position_index] for state in states]
+        positions[:, self._columns] = states[:, self.position_index]
         return positions
 
     @cached_property

@@ -31,9 +31,10 @@ from logs.recording.file_scan import RecordedMessage, count_by_topic
 from logs.recording.output_files import refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.reader import explain_missing_end, find_segments, read_messages
 from logs.recording.topics import HEADER, LIBRARY, decode, get_record_type, is_known, is_view
+from uavctl.arrays import Array
 from uavctl.config.load import find_nearest
 from uavctl.errors import RecordingError, need
-from uavctl.records import Record, Vec3
+from uavctl.records import Record, Vec3, Vector
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -134,6 +135,8 @@ def _choose_form(kind: Any) -> _Form:
         if _is_record(arguments[0]):  # they stand in a table of their own
             return _Leaf(int, len)
         return _Parts("_", lambda value: dict(enumerate(value)), {}, arguments[0])
+    if kind == Array:
+        return _Parts("_", lambda value: dict(enumerate(value.tolist())), {}, Vector)
     if origin is dict:
         if arguments[1] is object:
             return _Leaf(str, lambda value: msgspec.json.encode(value).decode())

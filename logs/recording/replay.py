@@ -21,6 +21,7 @@ from logs.recording.notes import RecorderNote
 from logs.recording.topics import (
     DIGITS,
     are_identical,
+    convert_numpy,
     decode,
     get_record_type,
     is_encoding_of,
@@ -184,7 +185,8 @@ def name_stage(topic: str) -> str:
 
 def find_different_leaves(recorded: Record, replayed: Record) -> list[Leaf]:
     """Return the leaves in which two records of a topic differ in any bit."""
-    return list(iterate_different_leaves(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed)))
+    plain, other = (msgspec.to_builtins(record, enc_hook=convert_numpy) for record in (recorded, replayed))
+    return list(iterate_different_leaves(plain, other))
 
 
 def iterate_different_leaves(recorded: object, replayed: object, path: str = "") -> Iterator[Leaf]:

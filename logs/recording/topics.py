@@ -14,7 +14,6 @@ import typing
 import zlib
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
-from itertools import chain, islice
 from typing import cast
 
 import msgspec
@@ -164,17 +163,19 @@ def get_definition(topic: str) -> Definition:
 
 def _make_schema(record: type[Record]) -> dict[str, object]:
     (reference,), parts = msgspec.json.schema_components(
-        [record], schema_hook=_make_any_schema, ref_template="#/$defs/{name}"
+        [record], schema_hook=_make_type_schema, ref_template="#/$defs/{name}"
     )
     name = cast("str", reference["$ref"]).rpartition("/")[2]
     top: dict[str, object] = parts.pop(name)
     return {**top, "$defs": parts} if parts else top
 
 
-def _make_any_schema(kind: type) -> dict[str, object]:
-    """Return the schema of a value of any type, which msgspec cannot make itself."""
+def _make_type_schema(kind: type) -> dict[str, object]:
+    """Return the schema of a type that msgspec does not know: any value, or the rows of a matrix."""
     if kind is object:
         return {"description": "any JSON value"}
+    if kind is np.ndarray:
+        return msgspec.json.schema(Matrix)
     raise NotImplementedError(kind)
 
 
@@ -189,17 +190,17 @@ class EncodingError(RecordingError):
     """A value cannot be written so that it reads back the same."""
 
 
-def _convert_numpy(value: object) -> object:
+def convert_numpy(value: object) -> object:
     """Turn numpy values of a record into plain numbers."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise NotImplementedError
 
 
-_ENCODER = msgspec.json.Encoder(enc_hook=_convert_numpy)
+_ENCODER = msgspec.json.Encoder(enc_hook=convert_numpy)
 # MessagePack keeps the eight bytes of each float behind 0xcb: where the exponent has all bits set, it is not finite.
 # Other values may have such bytes too, which costs time only.
-_BINARY = msgspec.msgpack.Encoder(enc_hook=_convert_numpy)
+_BINARY = msgspec.msgpack.Encoder(enc_hook=convert_numpy)
 _NON_FINITE_BYTES = re.compile(rb"\xcb[\x7f\xff][\xf0-\xff]", re.DOTALL)
 
 
@@ -234,11 +235,9 @@ def round_plan(plan: Plan) -> Plan:
         return plan
     crc32, rounded = 0, {}
     for name in MATRICES:
-        matrix: Matrix = getattr(plan, name)
-        exact = np.array([*chain.from_iterable(matrix)], dtype=np.float64)
-        crc32 = zlib.crc32(exact.tobytes(), crc32)
-        numbers = iter(_round(exact).tolist())
-        rounded[name] = tuple(tuple(islice(numbers, len(row))) for row in matrix)
+        matrix: Array = getattr(plan, name)
+        crc32 = zlib.crc32(matrix.tobytes(), crc32)
+        rounded[name] = _round(matrix)
     return msgspec.structs.replace(plan, exact_crc32=crc32, **rounded)
 
 
@@ -314,13 +313,21 @@ def _decode_fields(data: bytes, kind: type[Record]) -> Record:
     fields = msgspec.json.decode(data)
     # the gap of most plans is the only one: their thousands of numbers need not be looked through
     if isinstance(fields, dict) and _restore_fields(fields, kind) == data.count(b'NaN"') + data.count(b'Infinity"'):
-        return msgspec.convert(fields, kind)
-    return msgspec.convert(_restore_tree(fields, kind), kind)
+        return msgspec.convert(fields, kind, dec_hook=_make_matrix)
+    return msgspec.convert(_restore_tree(fields, kind), kind, dec_hook=_make_matrix)
 
 
 @cache
 def _make_decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
-    return msgspec.json.Decoder(kind)
+    return msgspec.json.Decoder(kind, dec_hook=_make_matrix)
+
+
+def _make_matrix(kind: type, value: object) -> object:
+    """Make the matrix of a field of type `Array` from its rows, which must be of one length; keep any other value."""
+    if kind != Array:
+        return value
+    matrix = np.array(msgspec.convert(value, Matrix), dtype=np.float64)
+    return matrix if matrix.size else matrix.reshape(len(matrix), 0)
 
 
 def _get_exact_bytes(value: object) -> bytes | None:
@@ -349,9 +356,9 @@ def _may_be_non_finite(value: object) -> bool:
 
 def _spell_field(value: object) -> object:
     """Return a record's field with non-finite floats as text; the numbers of a plan without any are not searched."""
-    if isinstance(value, tuple) and not _may_be_non_finite(value):
+    if isinstance(value, tuple | np.ndarray) and not _may_be_non_finite(value):
         return value
-    return _spell_tree(msgspec.to_builtins(value, enc_hook=_convert_numpy))
+    return _spell_tree(msgspec.to_builtins(value, enc_hook=convert_numpy))
 
 
 def _spell_tree(value: object) -> object:
@@ -378,6 +385,7 @@ def _restore_tree(value: object, kind: object) -> object:
     if isinstance(value, str):
         return _NON_FINITE.get(value, value) if float in _list_alternatives(kind) else value
     if isinstance(value, list):
+        kind = Matrix if kind == Array else kind
         return [
             _restore_tree(entry, item) for entry, item in zip(value, _list_item_types(kind, len(value)), strict=True)
         ]

@@ -39,7 +39,6 @@ from uavctl.records import (
     Header,
     LinkEstimate,
     LinkStats,
-    Matrix,
     Plan,
     Record,
     Setpoint,
@@ -276,11 +275,11 @@ def _get_room_sides(design: DesignView, lower: Array, upper: Array) -> tuple[Vec
     )
 
 
-def _compute_semi_axes(design: DesignView, backoff: Matrix) -> Array:
+def _compute_semi_axes(design: DesignView, backoff: Array) -> Array:
     """Return the semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
     reach = np.zeros((len(backoff), len(design.target)))
     for state, row, size in design.position_rows:
-        np.maximum(reach[:, state], np.array([stage[row] for stage in backoff]) / size, out=reach[:, state])
+        np.maximum(reach[:, state], backoff[:, row] / size, out=reach[:, state])
     return design.positions_of(reach)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -178,7 +177,7 @@ def _draw_path_and_shadow(ax: Axes, path_m: Array, floor_m: float, role: str) ->
 
 def _draw_plan_3d(ax: Axes, design: DesignView, plan: Plan) -> None:
     """Draw a plan's mean and, at a few stages, ellipsoids with its back-offs as semi-axes."""
-    positions = np.array([design.position_of(state) for state in plan.states])
+    positions = design.positions_of(plan.states)
     ax.plot(*project_3d(positions).T, color=colour("plan"), lw=1.2, marker=".", ms=3, zorder=4)
     for stage in _STAGES:
         if stage < len(plan.states):
@@ -193,7 +192,7 @@ def _draw_plan_3d(ax: Axes, design: DesignView, plan: Plan) -> None:
             )
 
 
-def _find_largest_backoff(design: DesignView, backoff: Sequence[float]) -> list[float]:
+def _find_largest_backoff(design: DesignView, backoff: Array) -> list[float]:
     """Return the largest back-off from a limit of each state (n_x,), in its unit; 0 without limits."""
     box, backoffs = design.state_box, [0.0] * len(design.target)
     for state in design.position_index:

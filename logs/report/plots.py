@@ -317,7 +317,7 @@ def draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
         else:
             ax.axhline(sign * limit_values[0], color=colour("limit"), lw=1.2, ls=DASHED)
         scale = abs(flight.design.c_x[row][index])
-        reserve = np.array([max(stage[row] for stage in plan.backoff_x) for plan in plans]) / scale
+        reserve = np.array([plan.backoff_x[:, row].max() for plan in plans]) / scale
         if len(plans):
             # The last one is flown to the end of its step, or on through a silence.
             ends_s = np.append(t_s, _find_plan_end_s(flight))
@@ -371,7 +371,7 @@ def _draw_plans_above(flight: FlightData, plans: list[Plan], end_s: float) -> Dr
         ax = canvas.axes("From above", "east [m]", "north [m]")
         canvas.cursor_axes = "above"
         for plan in plans:
-            north, east, _ = np.array([design.position_of(state) for state in plan.states]).T
+            north, east, _ = design.positions_of(plan.states).T
             ax.plot(east, north, "-", color=colour("plan"), lw=1.3, marker=".", ms=3, zorder=3)
             ax.plot(east[0], north[0], "o", ms=4.5, color=colour("plan"), zorder=5)
         ax.plot(flown[:, 1], flown[:, 0], color=colour("truth"), lw=1.5, zorder=4)
@@ -395,10 +395,9 @@ def _get_component(flight: FlightData, index: int) -> list[float]:
 def _draw_plan(ax: Axes, flight: FlightData, plan: Plan, index: int, sign: float) -> None:
     """Draw a plan's predicted mean, and its back-off: the reserve for disturbance and estimation error."""
     t_s = _compute_plan_times(flight, plan)
-    mean = np.array([state[index] for state in plan.states])
-    box, rows = flight.design.state_box, np.array(plan.backoff_x)
+    mean, box = plan.states[:, index], flight.design.state_box
     below, above = (
-        rows[:, row] / abs(flight.design.c_x[row][index]) if row >= 0 else np.zeros(len(mean))
+        plan.backoff_x[:, row] / abs(flight.design.c_x[row][index]) if row >= 0 else np.zeros(len(mean))
         for row in (box.row_lower[index], box.row_upper[index])
     )
     ax.fill_between(t_s, sign * (mean - below), sign * (mean + above), color=colour("plan"), alpha=0.16, lw=0)

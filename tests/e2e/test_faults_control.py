@@ -113,7 +113,7 @@ def test_row_4_a_late_packet_ages_from_its_capture_and_the_plan_is_rebased() -> 
     assert rebased.plan is not None
     assert rebased.estimate is not None
     assert (rebased.plan.base_ns, rebased.plan.captured_ns) == (boundary_ns(5), boundary_ns(3) - 50 * MS)
-    assert rebased.plan.states[0] == rebased.estimate.mean  # predicted to the boundary, not as it was captured
+    assert tuple(rebased.plan.states[0]) == rebased.estimate.mean  # predicted to the boundary, not as it was captured
 
 
 @pytest.mark.fault(5)

@@ -48,6 +48,6 @@ def test_a_plan_has_the_numbers_of_the_answer_whatever_their_order_in_memory(row
     plan = ask_solver(Known(answer), 7, base, np.zeros(N_X), NOMINAL, (H, N_U), "design").plan
     assert plan is not None and plan.reference == tuple(answer.reference.tolist())
     for name in ("inputs", "states", "backoff_x", "backoff_u"):
-        rows = getattr(plan, name)
-        assert [list(row) for row in rows] == getattr(answer, name).tolist(), name
-        assert all(type(row) is tuple and all(type(value) is float for value in row) for row in rows)
+        asked, planned = getattr(answer, name), getattr(plan, name)
+        assert planned.tolist() == asked.tolist() and planned.flags.c_contiguous, name
+        assert not np.shares_memory(planned, asked) and not planned.flags.writeable, name

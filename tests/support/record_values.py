@@ -8,12 +8,20 @@ import typing
 from enum import Enum
 
 import msgspec
+import numpy as np
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from uavctl.arrays import Array
 
 
 def values(kind: object) -> st.SearchStrategy[object]:
     """Any value of a field's type; texts look like spelled floats now and then."""
     origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if kind == Array:
+        # A matrix without rows has no columns in a recording either.
+        shapes = st.tuples(st.integers(1, 3), st.integers(0, 3)) | st.just((0, 0))
+        return shapes.flatmap(lambda shape: arrays(np.float64, shape, elements=values(float)))
     if origin is types.UnionType:
         return st.one_of(*map(values, args))
     if origin is tuple and args[-1] is Ellipsis:

@@ -137,7 +137,7 @@ def _input(pilot: _Pilot, scene: Scene) -> Array:
     if pilot.falling or pilot.plan is None:
         velocity = pilot.mean[1 :: scene.per_axis]
         return np.clip(-1.5 * velocity if scene.per_axis == 3 else 0 * velocity, -scene.input_limit, scene.input_limit)
-    return np.array(pilot.plan.inputs[min(pilot.index, 11)])
+    return np.asarray(pilot.plan.inputs[min(pilot.index, 11)])
 
 
 def _plan(scene: Scene, mean: Array, at_ns: int, step: int) -> Plan:
@@ -159,10 +159,10 @@ def _plan(scene: Scene, mean: Array, at_ns: int, step: int) -> Plan:
         captured_ns=at_ns - round(CAPTURE_DELAY_S * 1e9),
         status=SolveStatus.OPTIMAL,
         method="exact",
-        inputs=_rows(inputs),
-        states=_rows(states),
-        backoff_x=_rows(backoff),
-        backoff_u=_rows([np.zeros(len(c_u))] * 12),
+        inputs=np.array(inputs),
+        states=np.array(states),
+        backoff_x=np.array(backoff),
+        backoff_u=np.zeros((12, len(c_u))),
         reference=tuple(scene.target.tolist()),
         slack=0.0,
         offset=0.0,
@@ -173,10 +173,6 @@ def _plan(scene: Scene, mean: Array, at_ns: int, step: int) -> Plan:
         iterations=14,
         design_id="3f1c9a",
     )
-
-
-def _rows(vectors: list[Array]) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(v.tolist()) for v in vectors)
 
 
 def _position(scene: Scene, x: Array) -> tuple[float, float, float]:

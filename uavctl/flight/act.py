@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import msgspec
-import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.flight.context import FilterView, TickContext, expand_axes, read_position, read_velocity
@@ -74,7 +73,7 @@ def _make_setpoint(
     if fallback is not None:
         wanted = _compute_fallback_accel(fallback, context, supervised, decided)
     elif plan is not None:
-        wanted = controller.plant.to_accel(np.array(plan.inputs[context.step - plan.seq]))
+        wanted = controller.plant.to_accel(plan.inputs[context.step - plan.seq])
     is_level = fallback is not None and fallback.reason is FallbackReason.ENVELOPE
     before = ZERO if is_level else state.plan.sent_mps2
     accel, limited = limit_setpoint(wanted, before, controller.tick_ns * 1e-9, controller.limits)
@@ -91,7 +90,7 @@ def _compute_yaw(state: ControlState, context: TickContext, decided: Decided) ->
     planned_mps = None
     if plan is not None:
         plant = controller.plant
-        planned_mps = expand_axes(plant, plan.states[context.step - plan.seq], plant.velocity_index, 0.0)
+        planned_mps = expand_axes(plant, plan.states[context.step - plan.seq].tolist(), plant.velocity_index, 0.0)
     tick_s = controller.tick_ns * 1e-9
     return compute_yaw(
         state.plan.sent_yaw_rad, context.inputs.motion, planned_mps, context.at_ns, tick_s, controller.yaw

@@ -7,14 +7,12 @@
 
 from __future__ import annotations
 
-from struct import iter_unpack
-
 import msgspec
 import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.errors import in_words
-from uavctl.records import Estimate, Matrix, Plan, SolveStatus, Vector
+from uavctl.records import Estimate, Plan, SolveStatus
 from uavctl.smpc.answer import Answer, Preview, Solver, are_finite
 
 # Errors that arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
@@ -70,11 +68,11 @@ def _make_plan(answer: Answer, inputs: Array, base: Estimate, design_id: str) ->
         captured_ns=base.captured_ns,
         status=answer.status,
         method=answer.method,
-        inputs=_make_rows(inputs),
-        states=_make_rows(answer.states),
-        backoff_x=_make_rows(answer.backoff_x),
-        backoff_u=_make_rows(answer.backoff_u),
-        reference=_make_row(answer.reference),
+        inputs=_copy(inputs),
+        states=_copy(answer.states),
+        backoff_x=_copy(answer.backoff_x),
+        backoff_u=_copy(answer.backoff_u),
+        reference=tuple(answer.reference.tolist()),
         slack=float(answer.slack),
         offset=float(answer.offset),
         terminal_miss=float(answer.terminal_miss),
@@ -88,12 +86,8 @@ def _make_plan(answer: Answer, inputs: Array, base: Estimate, design_id: str) ->
     )
 
 
-def _make_row(values: Array) -> Vector:
-    return tuple(values.tolist())
-
-
-def _make_rows(values: Array) -> Matrix:
-    if len(values) and (values.strides[0] == 0 or not values.size):  # rows are alike: broadcast, or empty
-        return (_make_row(values[0]),) * len(values)
-    # Rows of doubles, without a list for each
-    return tuple(iter_unpack(f"{values.shape[1]}d", values.tobytes()))
+def _copy(values: Array) -> Array:
+    """Copy an array that the solver may use again; the copy cannot be written."""
+    copy = np.array(values, dtype=np.float64, order="C")  # row by row: so are its checksum and its bits
+    copy.flags.writeable = False
+    return copy

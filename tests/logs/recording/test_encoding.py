@@ -39,10 +39,16 @@ def test_every_record_reads_back_bit_for_bit(topic: Topic) -> None:
         assert isinstance(record, Record)
         data = encode(record)
         json.loads(data, parse_constant=pytest.fail)  # plain JSON, no bare NaN
+        found = decode(topic.name, data, 0)
         # repr tells every float apart, the sign of zero and NaN included
-        assert repr(decode(topic.name, data, 0)) == repr(round_plan(record) if isinstance(record, Plan) else record)
+        assert repr_whole(found) == repr_whole(round_plan(record) if isinstance(record, Plan) else record)
 
     check()
+
+
+def repr_whole(record: Record) -> str:
+    """Return the text of a record, its matrices as lists: numpy shortens the text of an array."""
+    return repr(msgspec.to_builtins(record, enc_hook=lambda matrix: matrix.tolist(), builtin_types=(bytes,)))
 
 
 @given(values(Truth), values(Truth))
@@ -52,18 +58,19 @@ def test_records_that_are_alike_are_so_in_every_bit(one: Truth, other: Truth) ->
     assert are_identical(one, other) == (repr(one) == repr(other))  # the sign of a zero too
 
 
-def plan_of(rows: Matrix) -> Plan:
+def make_plan(rows: Matrix) -> Plan:
     """Return a plan whose matrices all have these rows."""
+    matrix = np.array(rows)
     return Plan(
         seq=1,
         base_ns=2**60,
         captured_ns=0xCB7FF8,
         status=SolveStatus.OPTIMAL,
         method="NaN",
-        inputs=rows,
-        states=rows,
-        backoff_x=rows,
-        backoff_u=rows,
+        inputs=matrix,
+        states=matrix,
+        backoff_x=matrix,
+        backoff_u=matrix,
         reference=rows[0],
         slack=0.25,
         offset=-0.0,
@@ -79,16 +86,16 @@ def plan_of(rows: Matrix) -> Plan:
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False).filter(lambda one: one == 0.0 or 1e-9 < abs(one) < 1e15)
 
 
-@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=4).map(tuple), values(Plan))
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=4), values(Plan))
 def test_a_recorded_plan_has_four_digits_of_each_number_and_the_checksum_of_all_bits(
-    matrix: tuple[tuple[float, float], ...], plan: Plan
+    rows: list[tuple[float, float]], plan: Plan
 ) -> None:
-    exact = msgspec.structs.replace(plan, exact_crc32=None, **dict.fromkeys(MATRICES, matrix))
+    exact = msgspec.structs.replace(plan, exact_crc32=None, **dict.fromkeys(MATRICES, np.array(rows)))
     found = round_plan(exact)
-    numbers = [number for row in matrix for number in row]
+    numbers = [number for row in rows for number in row]
     assert found.exact_crc32 == zlib.crc32(4 * struct.pack(f"={len(numbers)}d", *numbers))
-    assert all(getattr(found, name) == found.states for name in MATRICES)
-    rounded = [number for row in found.states for number in row]
+    assert all(getattr(found, name).tolist() == found.states.tolist() for name in MATRICES)
+    rounded = found.states.ravel().tolist()
     assert rounded == [float(f"{number:.3e}") for number in rounded]
     assert rounded == pytest.approx(numbers, rel=5.0001e-4, abs=0.0)
     assert round_plan(found) is found
@@ -96,10 +103,11 @@ def test_a_recorded_plan_has_four_digits_of_each_number_and_the_checksum_of_all_
 
 @pytest.mark.parametrize("name", MATRICES)
 def test_the_last_bit_of_a_plan_changes_what_is_recorded(name: str) -> None:
-    plan = plan_of(((0.1, 1.0), (2.0, 3.0)))
-    nudged = msgspec.structs.replace(plan, **{name: ((0.1, 1.0), (2.0, math.nextafter(3.0, 4.0)))})
+    plan = make_plan(((0.1, 1.0), (2.0, 3.0)))
+    nudged = msgspec.structs.replace(plan, **{name: np.array([[0.1, 1.0], [2.0, math.nextafter(3.0, 4.0)]])})
     assert encode(nudged) != encode(plan)
-    assert round_plan(nudged).states == round_plan(plan).states
+    assert round_plan(nudged).states.tolist() == round_plan(plan).states.tolist()
+    assert nudged != plan and plan == make_plan(((0.1, 1.0), (2.0, 3.0)))
 
 
 def test_alike_looks_at_every_bit_and_never_raises() -> None:
@@ -131,8 +139,8 @@ def test_spelling_of_non_finite_floats() -> None:
 @given(st.sampled_from(["cost", "gap", "backoff_x"]), st.sampled_from([math.nan, math.inf, -math.inf]))
 def test_fields_beside_a_non_finite_float_are_written_as_without_it(field: str, value: float) -> None:
     rows = ((0.1, -0.0, 5e-324), (1e300, 1 / 3, 7.0))
-    plan = plan_of(rows)
-    odd = ((value, -0.0, 5e-324), *rows[1:]) if field == "backoff_x" else value
+    plan = make_plan(rows)
+    odd = np.array([(value, -0.0, 5e-324), *rows[1:]]) if field == "backoff_x" else value
     changed = msgspec.structs.replace(plan, **{field: odd})
     written = encode(changed)
     spelled = "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
@@ -141,7 +149,7 @@ def test_fields_beside_a_non_finite_float_are_written_as_without_it(field: str, 
     assert written == msgspec.json.encode(fields)
     for method in ("NaN", "qp"):  # a text that looks like a number stays one
         whole = msgspec.structs.replace(plan, method=method, **{field: odd})
-        assert repr(decode("/uavctl/plan", encode(whole), 0)) == repr(round_plan(whole))
+        assert are_identical(decode("/uavctl/plan", encode(whole), 0), round_plan(whole))
 
 
 def test_text_is_left_alone() -> None:

@@ -133,7 +133,7 @@ def compute_plan_errors_m(flight: FlightData) -> Array:
             continue  # no plan was flown in between
         share = (plan.base_ns + steps_ahead * dt_ns - int(decided_ns[left])) / span
         position = (1.0 - share) * steps.state[left][index] + share * steps.state[right][index]
-        errors.append(float(np.linalg.norm(position - np.array(plan.states[steps_ahead])[index])))
+        errors.append(float(np.linalg.norm(position - plan.states[steps_ahead, index])))
     return np.array(errors)
 
 
