@@ -88,6 +88,6 @@ def _make_plan(answer: Answer, inputs: Array, base: Estimate, design_id: str) ->
 
 def _copy(values: Array) -> Array:
     """Copy an array that the solver may use again; the copy cannot be written."""
-    copy = np.array(values, dtype=np.float64, order="C")  # row by row: so are its checksum and its bits
-    copy.flags.writeable = False
+    copy = values.copy()  # row by row, whatever the order in memory was
+    copy.setflags(write=False)
     return copy
