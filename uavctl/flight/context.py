@@ -43,6 +43,7 @@ class TickContext(msgspec.Struct, frozen=True, eq=False):
     not_ready_reason: str  # why the vehicle takes no setpoints; empty if it does
     is_controllable: bool  # whether the vehicle is known to be in the air and to take setpoints
     gap_end_ns: int | None  # end of a long gap between ticks, after which no heartbeat has come yet
+    awaits_heartbeat: bool  # whether that gap is the only reason why the vehicle takes no setpoints
 
 
 class FilterView(msgspec.Struct, frozen=True, eq=False):
@@ -62,7 +63,8 @@ def locate_on_grid(
     step, into = divmod(inputs.tick, controller.ticks_per_step)
     mode, not_ready_reason, vehicle = state.mode, describe_not_ready(inputs.vehicle), inputs.vehicle
     gap_end_ns = _find_gap_end_ns(state.plan.gap_end_ns, inputs, controller.tick_ns)
-    if gap_end_ns is not None and not not_ready_reason:
+    awaits_heartbeat = gap_end_ns is not None and not not_ready_reason
+    if awaits_heartbeat:
         not_ready_reason = AFTER_GAP
     return TickContext(
         inputs=inputs,
@@ -77,6 +79,7 @@ def locate_on_grid(
         not_ready_reason=not_ready_reason,
         is_controllable=vehicle is not None and not not_ready_reason and not vehicle.landed and not vehicle.own_climb,
         gap_end_ns=gap_end_ns,
+        awaits_heartbeat=awaits_heartbeat,
     )
 
 

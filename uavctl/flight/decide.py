@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
-from uavctl.flight.context import AFTER_GAP, FilterView, TickContext, read_position, read_velocity
+from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import make_estimate, select_covariance
 from uavctl.flight.fallback import (
@@ -175,7 +175,7 @@ def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
     at_ns, fallback = phase.context.at_ns, draft.fallback
     if fallback is not None and fallback.is_over:
         return _fall_back(draft, fallback, phase, "handed over")
-    if why_not == AFTER_GAP:
+    if phase.context.awaits_heartbeat:
         # Its own failsafe may have the vehicle. A setpoint would end that of PX4.
         due = fallback if fallback is not None and fallback.is_final else None
         return replace(draft, plan=None, fallback=due, reason=why_not, sends_nothing=True)

@@ -1,7 +1,7 @@
 """Phase 6 of a tick: events for people, from the states before and after.
 
-1. The link estimate counts the step that ends at a boundary.
-2. Alarms that last are reported once, when they begin: the link, inertial data, the bias, a strong push.
+1. The link estimate and the risk count the step that ends at a boundary.
+2. Alarms that last are reported once, when they begin: the link, inertial data, the bias, a strong push, the risk.
 3. Orders, a new start of the filter, a breach of the envelope, a failed controller, refused samples, missed ticks,
    the solver, relaxed limits and a change of mode have an event each, in this order.
 """
@@ -24,6 +24,8 @@ from uavctl.flight.measure import Measured
 from uavctl.flight.monitors.acceleration import describe_push
 from uavctl.flight.monitors.engaged import MonitorState
 from uavctl.flight.orders import Ordered
+from uavctl.flight.risk import report_saturation, update_risk
+from uavctl.flight.risk_state import RiskGroup
 from uavctl.flight.state import AlarmGroup, ControlState
 from uavctl.flight.supervise import Supervised
 from uavctl.records import ControlMode, Event, LinkEstimate, Severity, Vec3
@@ -66,7 +68,8 @@ class Reported(msgspec.Struct, frozen=True, eq=False):
 
     events: tuple[Event, ...]
     alarms: AlarmGroup
-    link: LinkEstimate | None  # at boundaries that were not missed
+    risk: RiskGroup
+    link: LinkEstimate | None  # with the risk; at boundaries that were not missed
 
 
 def report_events(
@@ -80,6 +83,9 @@ def report_events(
     """Report what has changed in a tick."""
     before, at_ns = state.alarms, context.at_ns
     counts, link = _count_link(before.link, context, supervised)
+    risk, risk_record = update_risk(state.risk, context, supervised, state.mission.progress, state.plan.flown)
+    if link is not None and risk_record is not None:
+        link = msgspec.structs.replace(link, risk=risk_record)
     link_alarms = before.link_alarms if link is None else _find_link_alarms(link, before.link_alarms)
     bias = _find_bias(context, supervised)
     inputs_at_bound = before.inputs_at_bound
@@ -98,7 +104,8 @@ def report_events(
         push_mps2 = context.controller.plant.to_accel(np.array(bias))
         events += report_bias(push_mps2, before.inputs_at_bound, inputs_at_bound, at_ns)
     events += _report_push(state.monitors.engaged, supervised.monitors.engaged, context)
-    return Reported(events, AlarmGroup(counts, link_alarms, inertial, inputs_at_bound), link)
+    events += report_saturation(state.risk, risk, context)
+    return Reported(events, AlarmGroup(counts, link_alarms, inertial, inputs_at_bound), risk, link)
 
 
 def _make_event(at_ns: int, severity: Severity, code: str, text: str, count: int = 1, subject: str = "") -> Event:

@@ -5,7 +5,7 @@
 3 orders.py     accept or refuse the operator's orders
 4 decide.py     make a new plan, continue the old one, or fall back
 5 act.py        pass the setpoint through the setpoint limiter, note the input in the filter
-6 events.py     events for people
+6 events.py     count the step for the link and the risk; events for people
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from uavctl.flight.measure import Measured, measure
 from uavctl.flight.mission import find_target
 from uavctl.flight.monitors.external import ExternalState
 from uavctl.flight.orders import take_orders
-from uavctl.flight.risk import report_saturation, update_risk
-from uavctl.flight.risk_state import RiskGroup
 from uavctl.flight.state import ControlState, EstimatorGroup, FallbackGroup, MissionGroup, PlanGroup
 from uavctl.flight.supervise import Supervised, supervise
 from uavctl.records import (
@@ -79,35 +77,25 @@ def tick(
     ordered = take_orders(state, context)
     decided = decide(state, context, supervised, ordered)
     acted = act(state, context, measured, supervised, decided)
-    risk, risk_record = update_risk(state.risk, context, supervised, state.mission.progress, state.plan.flown)
     reported = report_events(state, context, measured, supervised, ordered, decided)
-    link = reported.link
-    if link is not None and risk_record is not None:
-        link = msgspec.structs.replace(link, risk=risk_record)
     output = TickOutput(
         estimate=supervised.view.estimate,
         plan=decided.new_plan,
         decision=_make_decision(context, measured, supervised, decided, acted),
         setpoint=acted.setpoint,
-        events=(*reported.events, *report_saturation(state.risk, risk, context)),
+        events=reported.events,
         refused=tuple(sample for sample, _ in measured.samples.refused),
-        link=link,
+        link=reported.link,
         land=decided.mode is ControlMode.LAND and context.mode is not ControlMode.LAND,
         unsafe_to_climb=supervised.unsafe_to_climb,
         position_inconsistent=supervised.position_inconsistent,
         newest_inconsistent=supervised.newest_inconsistent,
     )
-    return _make_state(context, measured, supervised, decided, acted, reported, risk), output
+    return _make_state(context, measured, supervised, decided, acted, reported), output
 
 
 def _make_state(
-    context: TickContext,
-    measured: Measured,
-    supervised: Supervised,
-    decided: Decided,
-    acted: Acted,
-    reported: Reported,
-    risk: RiskGroup,
+    context: TickContext, measured: Measured, supervised: Supervised, decided: Decided, acted: Acted, reported: Reported
 ) -> ControlState:
     """Make the state for the next tick."""
     monitors = supervised.monitors
@@ -139,7 +127,7 @@ def _make_state(
             jump_suspected=decided.jump_suspected,
         ),
         alarms=reported.alarms,
-        risk=risk,
+        risk=reported.risk,
     )
 
 
