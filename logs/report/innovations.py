@@ -43,14 +43,14 @@ class InnovationSamples:
     """Positions against their forecasts, by the flight's own filter."""
 
     t_s: Array  # capture times of the report (n,) [s]
-    error_m: Array  # position minus what the ones before it foretell (n, axes) [m]
-    std_m: Array  # deviation foretold (n, axes) [m]
+    error_m: Array  # position minus what the ones before it predict (n, axes) [m]
+    std_m: Array  # deviation predicted (n, axes) [m]
     lead_steps: NDArray[np.int64]  # steps ahead of a forecast, 1 … H (m,), of windows that follow each other
     distance: Array  # squared distance of the position from its forecast, by the forecast's covariance (m,)
 
     @property
     def normalised(self) -> Array:
-        """Errors over their foretold deviations (n, axes)."""
+        """Errors over their predicted deviations (n, axes)."""
         return self.error_m / self.std_m
 
 
@@ -99,7 +99,7 @@ class FilterReplay:
         self.spans_ns = _find_flown_spans_ns(flight)
 
     def iterate_one_step_errors(self) -> Iterator[tuple[Belief, Array, Array]]:
-        """Yield the belief after each position, and the position's error and foretold deviation (axes,) [m]."""
+        """Yield the belief after each position, and the position's error and predicted deviation (axes,) [m]."""
         belief, consecutive_positions = None, 0
         for at_ns, sample in self.samples:
             if belief is None:

@@ -49,14 +49,14 @@ def draw_coverage(leads: tuple[LeadVerdict, ...]) -> Drawing:
         ax.axhline(100.0 * leads[0].promised, color=colour("limit"), lw=1.2, ls=DASHED)
         ax.set_ylim(min(50.0, float(low.min()) - 5.0), 103.0)
         ax.set_xlim(0.0, t_s[-1] * 1.05)
-    label = "Share of the positions within the ellipsoid foretold for them, by the time ahead, with exact intervals"
+    label = "Share of the positions within the ellipsoid predicted for them, by the time ahead, with exact intervals"
     return Drawing("coverage", canvas.svg, label)
 
 
 def draw_errors(flight: FlightData, axis: str, t_s: Array, normalised: Array) -> Drawing:
-    """Draw the one-step errors of an axis over time, in foretold standard deviations."""
+    """Draw the one-step errors of an axis over time, in predicted standard deviations."""
     with open_canvas(f"error-{axis}", 2.3) as canvas:
-        ax = canvas.axes(f"Errors of the forecast, {axis}", "time [s]", "foretold deviations")
+        ax = canvas.axes(f"Errors of the forecast, {axis}", "time [s]", "predicted deviations")
         reach = two_sided_quantile()
         ax.axhspan(-reach, reach, color=colour("target"), alpha=0.15, lw=0)
         stride = max(1, -(-len(t_s) // MAX_VERDICT_MARKS))
@@ -64,7 +64,7 @@ def draw_errors(flight: FlightData, axis: str, t_s: Array, normalised: Array) ->
         limit = max(4.0, 1.1 * float(np.abs(normalised).max(initial=0.0)))
         ax.set_ylim(-limit, limit)
         set_time_axis(ax, flight)
-    return Drawing(f"error-{axis}", canvas.svg, f"Errors of the forecast {axis} over time, in foretold deviations")
+    return Drawing(f"error-{axis}", canvas.svg, f"Errors of the forecast {axis} over time, in predicted deviations")
 
 
 def draw_clocks(flight: FlightData, verdicts: tuple[ClockVerdict, ...]) -> Iterator[Drawing]:

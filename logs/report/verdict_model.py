@@ -38,11 +38,11 @@ BANDS = 4  # of frequencies, equally wide: of 30 errors each still has seven
 def compute_band_powers(normalised: Array) -> tuple[Array, Array]:
     """Return the mean squares of errors in bands of frequency, slow to quick, and the independent squares in each.
 
-    Each is about 1 where errors are white and as large as foretold; sums of squares of `count` coordinates in an
+    Each is about 1 where errors are white and as large as predicted; sums of squares of `count` coordinates in an
     orthonormal basis, so for errors whose covariance is at most the identity none is larger than χ² is.
 
     Args:
-        normalised: Errors over their foretold deviations (n,), n ≥ 2 `BANDS`.
+        normalised: Errors over their predicted deviations (n,), n ≥ 2 `BANDS`.
 
     Returns:
         Powers (`BANDS`,) and counts (`BANDS`,).
@@ -61,7 +61,7 @@ def compute_band_powers(normalised: Array) -> tuple[Array, Array]:
 
 
 def compute_power_bounds(counts: Array, tests: int) -> Array:
-    """Return bounds of `band_powers` (`BANDS`,) that hold together with `LEVEL` if errors are as foretold."""
+    """Return bounds of `band_powers` (`BANDS`,) that hold together with `LEVEL` if errors are as predicted."""
     return np.asarray(chdtri(counts, (1.0 - LEVEL) / tests) / counts)
 
 
@@ -75,18 +75,18 @@ class ModelOutcome(StrEnum):
     """Outcome of the tests of a model."""
 
     HOLDS = "holds"  # nothing speaks against it
-    CAUTIOUS = "cautious"  # errors were smaller than foretold, and that explains all else
-    REFUTED = "refuted"  # errors were larger than foretold, off on average, or told of the next by more than that
+    CAUTIOUS = "cautious"  # errors were smaller than predicted, and that explains all else
+    REFUTED = "refuted"  # errors were larger than predicted, off on average, or told of the next by more than that
     UNKNOWN = "unknown"  # too few positions to say
 
 
 class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Tests of one axis' one-step errors, over the deviation foretold for each."""
+    """Tests of one axis' one-step errors, over the deviation predicted for each."""
 
     axis: str
     count: int
     rms_m: float
-    mean: float  # 0 promised, in foretold deviations
+    mean: float  # 0 promised, in predicted deviations
     mean_bound: float  # |mean| is below this with `level`, if the model is right
     mean_p: float
     variance: float  # about zero; 1 promised
@@ -98,25 +98,25 @@ class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
     ljung_box: float
     whiteness_p: float
     power: tuple[float, ...]  # mean squares of the errors by frequency, from slow to quick; 1 promised
-    power_bound: tuple[float, ...]  # they are below these with `level`, if true errors are at most the foretold ones
+    power_bound: tuple[float, ...]  # they are below these with `level`, if true errors are at most the predicted ones
     mean_refuted: bool
     variance_refuted: bool
     whiteness_refuted: bool
 
     @property
     def has_smaller_errors(self) -> bool:
-        """Return whether errors were smaller than foretold; if they are not white, by their size alone."""
+        """Return whether errors were smaller than predicted; if they are not white, by their size alone."""
         is_significant = self.variance_refuted or (self.whiteness_refuted and self.variance_p < 1.0 - LEVEL)
         return is_significant and self.variance < 1.0
 
     @property
     def has_larger_errors(self) -> bool:
-        """Return whether errors were larger than foretold, at all frequencies together or in one band."""
+        """Return whether errors were larger than predicted, at all frequencies together or in one band."""
         return self.variance_refuted and self.variance > 1.0
 
     @property
     def has_correlated_errors(self) -> bool:
-        """Return whether an error tells of the next, by more than noise foretold too large explains."""
+        """Return whether an error tells of the next, by more than noise predicted too large explains."""
         has_excess_power = any(power > bound for power, bound in zip(self.power, self.power_bound, strict=True))
         return self.whiteness_refuted and not (self.has_smaller_errors and not has_excess_power)
 
@@ -186,7 +186,7 @@ def judge_axis(axis: str, normalised: Array, error_m: Array, tests: int) -> Axis
     """Test mean, spread and whiteness of one axis' normalised errors (n,).
 
     Args:
-        normalised: Errors over foretold deviations (n,), n > `LAGS`.
+        normalised: Errors over predicted deviations (n,), n > `LAGS`.
         error_m: The errors (n,) [m].
         tests: Tests that are to hold together with `LEVEL`.
     """
@@ -258,7 +258,7 @@ def _describe_outcome(
         text = f"{prefix} the model is cautious" + (f": {departures}." if departures else " some time ahead.")
     else:
         text = (
-            f"{prefix} the errors of the forecast are as large as foretold, centred and white: nothing speaks against "
+            f"{prefix} the errors of the forecast are as large as predicted, centred and white: nothing speaks against "
             "the model."
         )
     return f"{text} {_describe_leads(leads)}"
@@ -277,8 +277,8 @@ def _describe_departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
     )
     biased = _format_values([verdict for verdict in axes if verdict.mean_refuted], lambda verdict: verdict.mean)
     rows = (
-        (larger, f"errors are larger than foretold ({larger}), so back-offs are too small"),
-        (smaller, f"errors are smaller than foretold ({smaller}), so back-offs are larger there than they need be"),
+        (larger, f"errors are larger than predicted ({larger}), so back-offs are too small"),
+        (smaller, f"errors are smaller than predicted ({smaller}), so back-offs are larger there than they need be"),
         (
             correlated,
             f"an error tells of the next (correlation {correlated}), by more than caution explains: lag, drag, gain or "
@@ -287,8 +287,8 @@ def _describe_departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
         (
             slightly_correlated,
             f"an error tells a little of the next (correlation {slightly_correlated}), as it does where a noise is "
-            f"foretold larger "
-            "than it is: slow or quick, errors were not stronger than foretold by more than chance",
+            f"predicted larger "
+            "than it is: slow or quick, errors were not stronger than predicted by more than chance",
         ),
         (biased, f"the errors are {biased} deviations off on average"),
     )
@@ -296,7 +296,7 @@ def _describe_departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
 
 
 def _format_ratios(axes: list[AxisVerdict]) -> str:
-    """Return sizes of some axes' errors over the foretold ones, as in "0.8 × east, 0.7 × down"; empty without any."""
+    """Return sizes of some axes' errors over the predicted ones, as in "0.8 × east, 0.7 × down"; empty without any."""
     return ", ".join(f"{verdict.variance**0.5:.2g} × {verdict.axis}" for verdict in axes)
 
 

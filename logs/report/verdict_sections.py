@@ -39,19 +39,19 @@ def _describe_model_verdict(model: ModelVerdict | None) -> str:
     if model is None:
         return "not known"
     if model.outcome is ModelOutcome.CAUTIOUS:
-        return "cautious: errors were smaller than foretold"
+        return "cautious: errors were smaller than predicted"
     return _describe_verdict(model.refuted, model.outcome is not ModelOutcome.UNKNOWN) + _describe_departure(model)
 
 
 def _describe_departure(model: ModelVerdict) -> str:
     """Return what refutes a model, each test in a few words."""
     tests = [
-        *(["larger than foretold"] if any(axis_verdict.has_larger_errors for axis_verdict in model.axes) else ()),
+        *(["larger than predicted"] if any(axis_verdict.has_larger_errors for axis_verdict in model.axes) else ()),
         *(["off on average"] if any(axis_verdict.mean_refuted for axis_verdict in model.axes) else ()),
         *(["telling of the next"] if any(axis_verdict.has_correlated_errors for axis_verdict in model.axes) else ()),
     ]
     if any(lead.has_too_few_inside for lead in model.leads):
-        return ": too few positions were where they were foretold"
+        return ": too few positions were where they were predicted"
     return f": errors were {', '.join(tests)}" if tests else ""
 
 
@@ -110,7 +110,7 @@ def make_model_section(flight: FlightData, judged: Judgement) -> PageSection:
         ),
         *([verdict_figures.draw_coverage(verdict.leads)] if verdict.leads else ()),
     ]
-    columns = ("axis", "error [mm]", "× foretold", "bounds", "mean", "white")
+    columns = ("axis", "error [mm]", "× predicted", "bounds", "mean", "white")
     table = page.render_table(
         columns, [_make_axis_row(axis_verdict) for axis_verdict in verdict.axes], frozenset({1, 2, 3, 4, 5})
     )
@@ -135,8 +135,8 @@ def make_model_section(flight: FlightData, judged: Judgement) -> PageSection:
         )
     note = (
         "The flight's filter is run again over all positions it used, in the order of capture. An error is a position "
-        "minus what those before it foretell; if the model is right, errors are as large as foretold (1 ×), zero on "
-        "average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is foretold for "
+        "minus what those before it predict; if the model is right, errors are as large as predicted (1 ×), zero on "
+        "average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is predicted for "
         "the inputs that were then flown. ✗ refutes the model; ○ departs from it on the cautious side."
     )
     legend = (_PREDICTED, _BAND, Mark("dashed", "limit", "promised")) if drawings else ()

@@ -104,15 +104,15 @@ def test_a_recorded_failsafe_that_holds_is_distinguished_from_a_pilot_who_holds(
 
 
 @pytest.mark.parametrize("name", [*OF_OTHERS, *RELAYED])
-def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answer(name: str) -> None:
+def test_the_client_s_exchange_predicts_the_vehicle_s_clock_until_the_next_answer(name: str) -> None:
     """To half of the longest round trip that counts; simulated clocks run up to 3.4 % slow, and unevenly."""
     exchange, trips, off_ms = TimesyncExchange(), TimesyncClock(10_000_000_000), []
     for packet in packets(name):
         for trip in exchange.take(packet.data, packet.at_ns, outgoing=packet.outgoing):
-            foretold = trips.offset_ns(packet.at_ns)
+            predicted = trips.offset_ns(packet.at_ns)
             measured = (trip.sent_ns + packet.at_ns) // 2 - trip.remote_ns
-            if trips.add_answer(trip.sent_ns, trip.remote_ns, packet.at_ns) and foretold is not None:
-                off_ms.append(abs(measured - foretold) * 1e-6)
+            if trips.add_answer(trip.sent_ns, trip.remote_ns, packet.at_ns) and predicted is not None:
+                off_ms.append(abs(measured - predicted) * 1e-6)
     assert len(off_ms) > 40
     assert np.median(off_ms) < (3.0 if name in OF_OTHERS else 5.0)
 

@@ -350,14 +350,14 @@ def test_rejected_answers_and_round_trips_are_kept_count_of() -> None:
 @pytest.mark.parametrize(
     ("name", "median_ms", "p95_ms"), [("timesync-px4.csv", 4.0, 25.0), ("timesync-arducopter.csv", 1.0, 6.0)]
 )
-def test_recorded_clocks_are_foretold_until_the_next_answer(name: str, median_ms: float, p95_ms: float) -> None:
+def test_recorded_clocks_are_predicted_until_the_next_answer(name: str, median_ms: float, p95_ms: float) -> None:
     """PX4's simulator ran 1.3 % slow, unevenly: an average of the offsets was 47 ms behind (median), 102 ms (95 %)."""
     trips, errors = TimesyncClock(10 * SECOND), []
     for line in (DATA / name).read_text().splitlines()[1:]:
         sent_ns, remote_ns, received_ns = map(int, line.split(","))
-        foretold = trips.offset_ns(received_ns)
-        if foretold is not None and received_ns - sent_ns <= 10 * MS:
-            errors.append(abs(foretold - ((sent_ns + received_ns) // 2 - remote_ns)) / MS)
+        predicted = trips.offset_ns(received_ns)
+        if predicted is not None and received_ns - sent_ns <= 10 * MS:
+            errors.append(abs(predicted - ((sent_ns + received_ns) // 2 - remote_ns)) / MS)
         trips.add_answer(sent_ns, remote_ns, received_ns)
     errors.sort()
     assert len(errors) > 90

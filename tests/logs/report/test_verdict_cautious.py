@@ -1,4 +1,4 @@
-"""A model that foretells larger errors than were measured is cautious; larger or telling errors refute it."""
+"""A model that predicts larger errors than were measured is cautious; larger or telling errors refute it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def autoregressive(seed: int, n: int, scale: float, r: float) -> Array:
 
 
 def judged(values: Array) -> ModelVerdict:
-    """The verdict on errors whose foretold deviation is one."""
+    """The verdict on errors whose predicted deviation is one."""
     nothing = np.array([], dtype=np.int64)
     found = InnovationSamples(np.arange(float(len(values))), values, np.ones_like(values), nothing, np.array([]))
     return judge_innovations(found, AXES, 0.2)
@@ -45,7 +45,7 @@ def judged(values: Array) -> ModelVerdict:
 def too_noisy(seed: int, n: int) -> Array:
     """Errors (n, 3) of the steady filter of a random walk, true noises 1 and 1, which expects noise of 3 and 1.
 
-    By the scalar Riccati equation p = p - p²/(p+r) + q; the errors' covariance is at most the foretold one.
+    By the scalar Riccati equation p = p - p²/(p+r) + q; the errors' covariance is at most the predicted one.
     """
     rng = np.random.default_rng(seed)
     q, r_expected = 1.0, 9.0
@@ -68,7 +68,7 @@ def too_noisy(seed: int, n: int) -> Array:
         (1.0, 0.0, ModelOutcome.HOLDS),
         (1.3, 0.0, ModelOutcome.REFUTED),
         (1.0, 0.5, ModelOutcome.REFUTED),
-        (0.8, 0.7, ModelOutcome.REFUTED),  # slow errors have 3.6 times the power that was foretold
+        (0.8, 0.7, ModelOutcome.REFUTED),  # slow errors have 3.6 times the power that was predicted
     ],
 )
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -98,8 +98,8 @@ def test_expecting_too_much_noise_refutes_in_hardly_any_flight() -> None:
 def test_one_axis_with_larger_errors_refutes_all() -> None:
     verdict = judged(autoregressive(5, 800, 1.0, 0.0) * np.array([0.7, 1.0, 1.3]))
     assert verdict.outcome is ModelOutcome.REFUTED
-    assert "larger than foretold (1.3 × down)" in verdict.text
-    assert "smaller than foretold (0.7 × north)" in verdict.text
+    assert "larger than predicted (1.3 × down)" in verdict.text
+    assert "smaller than predicted (0.7 × north)" in verdict.text
 
 
 def test_ellipsoids_that_hold_more_than_promised_are_caution_and_fewer_are_not() -> None:
