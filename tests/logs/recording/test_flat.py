@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 
 import msgspec
+import numpy as np
 import pytest
 from flat_rig import tabulate
 from hypothesis import given
@@ -47,7 +48,9 @@ def leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
             yield from leaves(one, f"{name}.{key}")
     elif isinstance(value, tuple) and any(isinstance(one, msgspec.Struct) for one in value):
         yield name, len(value)
-    elif isinstance(value, tuple):
+    elif isinstance(value, np.ndarray):
+        yield from leaves(value.tolist(), name)
+    elif isinstance(value, tuple | list):
         for place, one in enumerate(value):
             yield from leaves(one, f"{name}_{place}")
     elif value is not None:
