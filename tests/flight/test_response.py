@@ -375,7 +375,7 @@ def compute_evidence_slowly(state: ResponseState, unexplained_mps2: float) -> tu
     """Compute the evidence by its definition, one hypothesis and one sample after the other."""
     newest_ns, before = state.samples[-1][0], np.array(state.baseline) / state.baseline[0]
     weights = np.array([one[0] * math.exp((at_ns - newest_ns) * 1e-9 / 0.4) for at_ns, one in state.samples])
-    count, weights = weights.sum(), weights / weights.sum()
+    count, weights = float(weights.sum()), weights / weights.sum()
     best = 0.0, ""
     for axes, wrong in (((0, 1), WRONG_HORIZONTAL), ((2,), WRONG_VERTICAL)):
         one, chosen = np.eye(len(axes)), list(axes)
@@ -388,7 +388,7 @@ def compute_evidence_slowly(state: ResponseState, unexplained_mps2: float) -> tu
             u = np.array(asked)[:, chosen] if late_ns else now
 
             def left(drag_1ps: float) -> np.ndarray:
-                return accel - u @ r.T + drag_1ps * velocity
+                return np.asarray(accel - u @ r.T + drag_1ps * velocity)
 
             def vary(drag_1ps: float) -> float:
                 e = left(drag_1ps)
@@ -449,7 +449,8 @@ def test_the_evidence_is_that_of_its_definition(kind: str, late_ns: int) -> None
         state, unexplained_mps2 = make_state(rng, answers, late_ns, rng.uniform(0.0, 2.0)), rng.choice([0.6, 1.0, 1.5])
         evidence, found = response.compute_evidence(state, unexplained_mps2)
         slow, slow_found = compute_evidence_slowly(state, unexplained_mps2)
-        assert (evidence, found) == (pytest.approx(slow, rel=1e-9), slow_found)
+        assert evidence == pytest.approx(slow, rel=1e-9)
+        assert found == slow_found
 
 
 UNIT_MPS2 = 1.0 / 0.65  # with it a jump of the wind has a standard deviation of 1 m/s²

@@ -301,11 +301,12 @@ def test_beside_wrong_inertial_data_gusts_bound_the_own_velocity() -> None:
         assert is_found(compare(north(own_mps), ZERO, inertial_wrong_ns=START_NS)) == (is_wrong, True)
 
 
-@pytest.mark.parametrize("known", [{}, {"inertial_wrong_ns": START_NS}])
-def test_the_velocity_at_the_begin_of_the_window_is_kept_where_the_own_one_is_wrong(known: dict[str, int]) -> None:
-    first = north(1.0), ZERO, north(0.25)
-    assert compare(north(3.0), ZERO, first=first, model=north(0.25), **known).right_beside_model_mps == north(0.75)
-    right = compare(north(1.0), north(-2.0), first=first, model=north(0.25), **known)
+@pytest.mark.parametrize("wrong_ns", [None, START_NS])
+def test_the_velocity_at_the_begin_of_the_window_is_kept_where_the_own_one_is_wrong(wrong_ns: int | None) -> None:
+    first, model = (north(1.0), ZERO, north(0.25)), north(0.25)
+    wrong = compare(north(3.0), ZERO, first=first, model=model, inertial_wrong_ns=wrong_ns)
+    assert wrong.right_beside_model_mps == north(0.75)
+    right = compare(north(1.0), north(-2.0), first=first, model=model, inertial_wrong_ns=wrong_ns)
     assert (is_found(right), right.right_beside_model_mps) == ((False, True), None)
 
 
