@@ -17,9 +17,12 @@ from scipy.spatial.transform import Rotation
 from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
-from uavctl.flight.monitors.acceleration import compute_lean_mps2
+from uavctl.flight.monitors import acceleration
+from uavctl.flight.monitors.acceleration import AccelerationState, compute_lean_mps2
 from uavctl.flight.monitors.engaged import INITIAL
+from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation, select_axes
+from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.outside import describe_beyond, describe_sideways, is_outside
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
@@ -420,3 +423,18 @@ def test_positions_that_leap_about_are_found() -> None:
     rng = np.random.default_rng(9)
     found = fly(lambda t, truth: truth + rng.normal(scale=0.7, size=3) * (t > 1.0))
     assert found is not None and found[0] < 1.5
+
+
+@pytest.mark.parametrize(("std_m", "sigma"), [(0.02, 1.5), (just_more(0.02), 4.0), (0.1, 4.0), (just_more(0.1), 1.5)])
+def test_where_positions_are_noisy_an_acceleration_counts_from_more_standard_deviations_on(
+    std_m: float, sigma: float
+) -> None:
+    """Its standard deviation is 1 m/s², and so is its bound."""
+    parameters = replace(PARAMETERS, unexplained_mps2=1.0)
+    for size_mps2, counts in ((sigma, False), (just_more(sigma), True)):
+        observer = Observer(AT_NS, np.array([ZERO, ZERO, (0.0, -size_mps2, 0.0)]), np.eye(3), np.zeros(3))
+        position = PositionObservation(
+            AT_NS, np.zeros(3), False, False, Motion(observer=observer), observer, seen(AT_NS), parameters, std_m
+        )
+        state, _ = acceleration.update(AccelerationState(), position)
+        assert state.over_ns == (AT_NS if counts else None)
