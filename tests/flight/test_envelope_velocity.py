@@ -513,7 +513,7 @@ def find_return(
         seen(at_ns),
         replace(PARAMETERS, disagreement_mps=disagreement_mps),
     )
-    offset = () if distance is None else ((at_ns, vec3(np.subtract(now_m, distance))),)
+    offset = () if distance is None else (*before, (at_ns, vec3(np.subtract(now_m, distance))))
     return velocity._find_return(before, offset, observation)
 
 
@@ -566,3 +566,64 @@ def test_one_delay_explains_all_places_of_a_frame_that_drifts(late_s: float, fou
     assert aligned is not None and aligned[0] == pytest.approx(found_s, abs=1e-9)
     np.testing.assert_allclose(aligned[1], points + found_s * velocities, atol=1e-8)
     assert velocity._align(places[:3]) is None and velocity._align(places[:4]) is not None
+
+
+def test_the_step_of_a_tick_and_the_mean_velocity_are_differences_of_distances() -> None:
+    path = tuple((START_NS + k * MS, (float(k * k), 0.0, 1.0)) for k in range(3))
+    steps = [velocity._find_step(path, START_NS + k * MS) for k in range(4)]
+    assert steps == [ZERO, (1.0, 0.0, 0.0), (3.0, 0.0, 0.0), ZERO]
+    assert velocity._find_mean_velocity((1.0, 2.0, 3.0), (2.0, 4.0, 2.0), 0.5) == (2.0, 4.0, -2.0)
+    assert velocity._find_mean_velocity(None, (2.0, 4.0, 2.0), 0.5) == ZERO
+    assert velocity._find_mean_velocity((2.0, 4.0, 2.0), None, 0.5) == ZERO
+
+
+def test_a_delay_explains_a_change_of_offsets_by_any_change_of_the_velocity() -> None:
+    assert velocity._bound_delay_s([-0.05, 1.0, 0.0], [0.5, 0.0, 0.0]) == pytest.approx(0.1)
+    assert velocity._bound_delay_s([-0.05, 1.0, 0.0], [0.0, 0.0, 0.0]) == 0.0
+
+
+def test_what_a_delay_leaves_may_be_as_large_as_the_bound() -> None:
+    within_m = (2.0 + 0.16) * PARAMETERS.disagreement_mps
+    places = ((START_NS - SECOND_NS, ZERO, (0.0, -1.0, 0.0)),)
+    for off_m, breached in ((within_m, False), (just_more(within_m), True)):
+        now = (off_m, -0.25, 0.0)  # 0.25 s late: the velocity has changed by 1 m/s
+        drift, *_ = velocity._find_drift(
+            VelocityState(places=places), ((START_NS, now),), np.array([now]), ZERO, PARAMETERS
+        )
+        assert (drift is not None) == breached
+
+
+@pytest.mark.parametrize("first_age_s", [29.0, 31.0])
+def test_the_delay_of_all_places_counts_now_and_is_found_anew_once_one_is_too_old(first_age_s: float) -> None:
+    """Offsets follow the velocity 0.2 s late; at 5 m/s that is more than the bound."""
+    ages_s, speeds = (first_age_s, 5.0, 4.0, 3.0, 2.0), (4.0, 1.0, -1.0, 2.0, 0.0)
+    places = tuple(
+        (START_NS - round(age_s * 1e9), (-0.2 * v, 0.0, 0.0), (v, 0.0, 0.0))
+        for age_s, v in zip(ages_s, speeds, strict=True)
+    )
+    kept, now, flown = places if first_age_s < 30.0 else places[1:], (-1.0, 0.0, 0.0), (5.0, 0.0, 0.0)
+    state = VelocityState(places=places, aligned=velocity._align(places))
+    drift, after, _ = velocity._find_drift(state, ((START_NS, now),), np.array([now]), flown, PARAMETERS)
+    assert drift is None and after[: len(kept)] == kept
+    # Another delay that is known, 0.1 s, counts as long as no place is too old.
+    state = structs.replace(state, aligned=(0.1, [[0.0, 0.0, 0.0]] * 5))
+    strict = replace(PARAMETERS, disagreement_mps=0.01)
+    drift, *_ = velocity._find_drift(state, ((START_NS, now),), np.array([now]), flown, strict)
+    assert (drift is None) == (first_age_s > 30.0)
+    assert drift is None or drift[1] == pytest.approx([-1.0 + 0.1 * 5.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("std_m", "contradicts"), [(0.012, True), (0.05, False)])
+def test_noise_that_may_make_a_difference_is_no_contradiction(std_m: float, contradicts: bool) -> None:
+    flown = ((AT_NS - 500 * MS, (-0.15, 0.0, 0.0)), (AT_NS - 250 * MS, (-0.075, 0.0, 0.0)))
+    state, path = VelocityState(offsets=flown), ((AT_NS - 600 * MS, ZERO), (AT_NS + MS, ZERO))
+    observer = Observer(AT_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
+    position = PositionObservation(
+        AT_NS, np.zeros(3), False, False, Motion(vehicle_path=path), observer, seen(AT_NS), PARAMETERS, std_m
+    )
+    after, _ = velocity.update(state, position)
+    assert after.apart_mps == pytest.approx(0.3) and after.is_contradicted == contradicts
+    # With too few offsets the delay that is known is kept with its places.
+    aligned = (0.1, [[0.0, 0.0, 0.0]])
+    few = VelocityState(offsets=state.offsets[1:], places=((AT_NS - SECOND_NS, ZERO, ZERO),), aligned=aligned)
+    assert velocity.update(few, position)[0].aligned == aligned
