@@ -17,10 +17,13 @@ from scipy.spatial.transform import Rotation
 from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
-from uavctl.flight.monitors.acceleration import compute_lean_mps2
+from uavctl.flight.monitors import acceleration
+from uavctl.flight.monitors.acceleration import AccelerationState, compute_lean_mps2
 from uavctl.flight.monitors.engaged import INITIAL
+from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation, select_axes
-from uavctl.flight.monitors.outside import SIDEWAYS_MPS, describe_beyond, describe_sideways, is_outside
+from uavctl.flight.monitors.observer import Observer
+from uavctl.flight.monitors.outside import describe_beyond, describe_sideways, is_outside
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
 
@@ -95,7 +98,7 @@ def test_being_beyond_a_limit_is_without_what_braking_needs(beyond_m: float, spe
 @pytest.mark.parametrize("by_itself", [True, False])
 def test_a_climb_that_is_not_upright_is_found_by_either_velocity(by_itself: bool) -> None:
     """By the vehicle's own velocity where it is known, else by the estimate; without both nothing is known."""
-    for speed, is_found in ((SIDEWAYS_MPS, False), (just_more(SIDEWAYS_MPS), True)):
+    for speed, is_found in ((0.6, False), (just_more(0.6), True)):
         moved, other = (0.0, speed, -9.0), (9.0, 0.0, 0.0)
         ours = seen(AT_NS, vehicle_motion=motion(moved, AT_NS) if by_itself else None)
         known = structs.replace(ours, position_m=ZERO, velocity_mps=other if by_itself else moved)
@@ -175,7 +178,7 @@ def test_braking_counts_from_when_the_setpoint_points_against_the_velocity(slows
     for now_ms in range(0, 1750, 50):
         at_ns, turned_ms = START_NS + now_ms * MS, now_ms - 700
         speed = 1.4 + 0.001 * min(now_ms, 700) - (0.001 if slows else 0.00001) * max(turned_ms, 0)
-        sent = (2.0, 0.0, 0.0) if turned_ms < 0 else (-2.0, 0.0, 0.0)
+        sent = (0.5, 0.0, 0.0) if turned_ms < 0 else (-2.0, 0.0, 0.0)
         ours = seen(at_ns, sent=sent, vehicle_motion=motion((speed, 0.0, 0.0), at_ns))
         watching, breach = update(watching, structs.replace(ours, braking=True), PARAMETERS)
         breaches += [] if breach is None else [now_ms]
@@ -420,3 +423,18 @@ def test_positions_that_leap_about_are_found() -> None:
     rng = np.random.default_rng(9)
     found = fly(lambda t, truth: truth + rng.normal(scale=0.7, size=3) * (t > 1.0))
     assert found is not None and found[0] < 1.5
+
+
+@pytest.mark.parametrize(("std_m", "sigma"), [(0.02, 1.5), (just_more(0.02), 4.0), (0.1, 4.0), (just_more(0.1), 1.5)])
+def test_where_positions_are_noisy_an_acceleration_counts_from_more_standard_deviations_on(
+    std_m: float, sigma: float
+) -> None:
+    """Its standard deviation is 1 m/s², and so is its bound."""
+    parameters = replace(PARAMETERS, unexplained_mps2=1.0)
+    for size_mps2, counts in ((sigma, False), (just_more(sigma), True)):
+        observer = Observer(AT_NS, np.array([ZERO, ZERO, (0.0, -size_mps2, 0.0)]), np.eye(3), np.zeros(3))
+        position = PositionObservation(
+            AT_NS, np.zeros(3), False, False, Motion(observer=observer), observer, seen(AT_NS), parameters, std_m
+        )
+        state, _ = acceleration.update(AccelerationState(), position)
+        assert state.over_ns == (AT_NS if counts else None)

@@ -23,6 +23,7 @@ from envelope_rig import (
     seen,
     trusted_velocity,
     update,
+    vec3,
 )
 from flight_rig import MS, START_NS, sample
 from msgspec import structs
@@ -32,6 +33,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import velocity
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
+from uavctl.flight.monitors.motion import Motion, PositionObservation, find_distance
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.velocity import VelocityState
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
@@ -487,3 +489,141 @@ def test_noise_bounds_the_slope_that_chance_makes(std_m: float) -> None:
     usual_m = 0.012
     slope_mps = 4.0 * std_m / math.sqrt(2.0 * 0.25**2) if std_m > usual_m else 0.0
     assert velocity._bound_noise_mps(three, std_m) == pytest.approx(slope_mps)
+
+
+def find_return(
+    before: velocity.Offsets,
+    now_m: Vec3,
+    path: tuple[tuple[int, Vec3], ...],
+    at_ns: int,
+    *,
+    resumed_ns: int | None,
+    disagreement_mps: float = 0.25,
+) -> tuple[float, list[float]] | None:
+    """The position `now_m` comes after a silence: its offset is that from the vehicle's own way."""
+    distance = find_distance(path, at_ns)
+    observer = Observer(at_ns, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
+    observation = PositionObservation(
+        at_ns,
+        np.array(now_m),
+        False,
+        False,
+        Motion(vehicle_path=path, resumed_ns=resumed_ns),
+        observer,
+        seen(at_ns),
+        replace(PARAMETERS, disagreement_mps=disagreement_mps),
+    )
+    offset = () if distance is None else (*before, (at_ns, vec3(np.subtract(now_m, distance))))
+    return velocity._find_return(before, offset, observation)
+
+
+@pytest.mark.parametrize("accel_mps2", [(0.7, -1.1, 0.4), (0.0, 0.0, 0.0)])
+def test_a_vehicle_that_accelerates_through_a_silence_comes_back_on_its_own_way(accel_mps2: Vec3) -> None:
+    """Ticks of 0.25 s count with the velocity at their end, Σ Δt v_k; the position is v_0 t + ½ a t²."""
+    accel, begin_mps, ticks, step_ns = np.array(accel_mps2), np.array([0.3, 0.0, -0.2]), 16, 250 * MS
+    times_s = 0.25 * np.arange(ticks)
+    flown = np.cumsum([0.25 * (begin_mps + s * accel) for s in times_s], axis=0)
+    path = tuple((START_NS + k * step_ns, vec3(flown[k])) for k in range(ticks))
+
+    def fly(s: float) -> Vec3:
+        return vec3(begin_mps * s + 0.5 * accel * s * s)
+
+    then, now = 2, 14
+    before = ((START_NS + then * step_ns, vec3(np.subtract(fly(times_s[then]), flown[then]))),)
+    at_ns, end = START_NS + now * step_ns, fly(times_s[now])
+    assert find_return(before, end, path, at_ns, resumed_ns=at_ns, disagreement_mps=1e-9) is None
+    found = find_return(
+        before, vec3(end + np.array([0.1, 0.2, -0.3])), path, at_ns, resumed_ns=at_ns, disagreement_mps=1e-9
+    )
+    assert found is not None and found[0] == pytest.approx(3.0) and found[1] == pytest.approx([0.1, 0.2, -0.3])
+    for resumed_ns in (None, at_ns - 1):  # it is not the first position
+        assert find_return(before, (9.0, 9.0, 9.0), path, at_ns, resumed_ns=resumed_ns) is None
+    assert find_return((), (9.0, 9.0, 9.0), path, at_ns, resumed_ns=at_ns) is None
+    assert find_return(before, (9.0, 9.0, 9.0), path[:now], at_ns, resumed_ns=at_ns) is None  # the way is not known
+
+
+def test_positions_come_back_just_so_far_beside_the_way() -> None:
+    """(0.8 s + 0.12 1/s t²) v_max, where no tick of the begin is known any more."""
+    path = ((START_NS, ZERO), (START_NS + 500 * MS, ZERO), (START_NS + 2500 * MS, ZERO))
+    at_ns, before = START_NS + 2000 * MS, ((START_NS, ZERO),)
+    bound_m = (0.8 + 0.12 * 2.0 * 2.0) * 0.25
+    for off_m, ends in ((bound_m, False), (just_more(bound_m), True)):
+        found = find_return(before, (0.0, -off_m, 0.0), path, at_ns, resumed_ns=at_ns)
+        assert (found is not None) == ends
+
+
+@pytest.mark.parametrize(("late_s", "found_s"), [(0.2, 0.2), (0.0, 0.0), (-0.1, 0.0), (0.5, 0.3)])
+def test_one_delay_explains_all_places_of_a_frame_that_drifts(late_s: float, found_s: float) -> None:
+    """Offsets are a constant, a drift, and the delay times the velocity: o = b + d t - τ v."""
+    rng, times_s = np.random.default_rng(4), np.array([0.0, 1.0, 2.5, 3.0, 4.25])
+    velocities, drift = rng.normal(0.0, 1.0, (5, 3)), np.array([0.3, -0.2, 0.1])
+    points = np.array([1.0, 2.0, -1.0]) + np.outer(times_s, drift) - late_s * velocities
+    places = tuple(
+        (START_NS + round(s * 1e9), vec3(point), vec3(v))
+        for s, point, v in zip(times_s, points, velocities, strict=True)
+    )
+    aligned = velocity._align(places)
+    assert aligned is not None and aligned[0] == pytest.approx(found_s, abs=1e-9)
+    np.testing.assert_allclose(aligned[1], points + found_s * velocities, atol=1e-8)
+    assert velocity._align(places[:3]) is None and velocity._align(places[:4]) is not None
+
+
+def test_the_step_of_a_tick_and_the_mean_velocity_are_differences_of_distances() -> None:
+    path = tuple((START_NS + k * MS, (float(k * k), 0.0, 1.0)) for k in range(3))
+    steps = [velocity._find_step(path, START_NS + k * MS) for k in range(4)]
+    assert steps == [ZERO, (1.0, 0.0, 0.0), (3.0, 0.0, 0.0), ZERO]
+    assert velocity._find_mean_velocity((1.0, 2.0, 3.0), (2.0, 4.0, 2.0), 0.5) == (2.0, 4.0, -2.0)
+    assert velocity._find_mean_velocity(None, (2.0, 4.0, 2.0), 0.5) == ZERO
+    assert velocity._find_mean_velocity((2.0, 4.0, 2.0), None, 0.5) == ZERO
+
+
+def test_a_delay_explains_a_change_of_offsets_by_any_change_of_the_velocity() -> None:
+    assert velocity._bound_delay_s([-0.05, 1.0, 0.0], [0.5, 0.0, 0.0]) == pytest.approx(0.1)
+    assert velocity._bound_delay_s([-0.05, 1.0, 0.0], [0.0, 0.0, 0.0]) == 0.0
+
+
+def test_what_a_delay_leaves_may_be_as_large_as_the_bound() -> None:
+    within_m = (2.0 + 0.16) * PARAMETERS.disagreement_mps
+    places = ((START_NS - SECOND_NS, ZERO, (0.0, -1.0, 0.0)),)
+    for off_m, breached in ((within_m, False), (just_more(within_m), True)):
+        now = (off_m, -0.25, 0.0)  # 0.25 s late: the velocity has changed by 1 m/s
+        drift, *_ = velocity._find_drift(
+            VelocityState(places=places), ((START_NS, now),), np.array([now]), ZERO, PARAMETERS
+        )
+        assert (drift is not None) == breached
+
+
+@pytest.mark.parametrize("first_age_s", [29.0, 31.0])
+def test_the_delay_of_all_places_counts_now_and_is_found_anew_once_one_is_too_old(first_age_s: float) -> None:
+    """Offsets follow the velocity 0.2 s late; at 5 m/s that is more than the bound."""
+    ages_s, speeds = (first_age_s, 5.0, 4.0, 3.0, 2.0), (4.0, 1.0, -1.0, 2.0, 0.0)
+    places = tuple(
+        (START_NS - round(age_s * 1e9), (-0.2 * v, 0.0, 0.0), (v, 0.0, 0.0))
+        for age_s, v in zip(ages_s, speeds, strict=True)
+    )
+    kept, now, flown = places if first_age_s < 30.0 else places[1:], (-1.0, 0.0, 0.0), (5.0, 0.0, 0.0)
+    state = VelocityState(places=places, aligned=velocity._align(places))
+    drift, after, _ = velocity._find_drift(state, ((START_NS, now),), np.array([now]), flown, PARAMETERS)
+    assert drift is None and after[: len(kept)] == kept
+    # Another delay that is known, 0.1 s, counts as long as no place is too old.
+    state = structs.replace(state, aligned=(0.1, [[0.0, 0.0, 0.0]] * 5))
+    strict = replace(PARAMETERS, disagreement_mps=0.01)
+    drift, *_ = velocity._find_drift(state, ((START_NS, now),), np.array([now]), flown, strict)
+    assert (drift is None) == (first_age_s > 30.0)
+    assert drift is None or drift[1] == pytest.approx([-1.0 + 0.1 * 5.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("std_m", "contradicts"), [(0.012, True), (0.05, False)])
+def test_noise_that_may_make_a_difference_is_no_contradiction(std_m: float, contradicts: bool) -> None:
+    flown = ((AT_NS - 500 * MS, (-0.15, 0.0, 0.0)), (AT_NS - 250 * MS, (-0.075, 0.0, 0.0)))
+    state, path = VelocityState(offsets=flown), ((AT_NS - 600 * MS, ZERO), (AT_NS + MS, ZERO))
+    observer = Observer(AT_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
+    position = PositionObservation(
+        AT_NS, np.zeros(3), False, False, Motion(vehicle_path=path), observer, seen(AT_NS), PARAMETERS, std_m
+    )
+    after, _ = velocity.update(state, position)
+    assert after.apart_mps == pytest.approx(0.3) and after.is_contradicted == contradicts
+    # With too few offsets the delay that is known is kept with its places.
+    aligned = (0.1, [[0.0, 0.0, 0.0]])
+    few = VelocityState(offsets=state.offsets[1:], places=((AT_NS - SECOND_NS, ZERO, ZERO),), aligned=aligned)
+    assert velocity.update(few, position)[0].aligned == aligned

@@ -73,6 +73,7 @@ def is_released(position_m: Vec3, velocity_mps: Vec3, sent_mps2: Vec3) -> bool:
     ("speed_mps", "sent_mps2", "takes_m"),
     [
         (1.0, 0.0, 1.5),  # 0.5 s until it brakes in the mean, then v / g
+        (0.5, 0.0, 0.75),
         (1.0, 2.0, 3.0),  # it gains 0.5 m/s, and takes 1 s until it brakes
         (1.0, -1.0, 1.5),  # a setpoint that brakes already is no credit
     ],
@@ -91,3 +92,11 @@ def test_a_controller_may_fly_so_near_to_a_wall_that_braking_ends_half_a_margin_
 def test_a_vehicle_beyond_a_wall_that_does_not_fly_further_is_not_released(speed_mps: float) -> None:
     for side in (1.0, -1.0):
         assert not is_released(along(0, 9.0 * side), along(0, speed_mps * side), ZERO)
+
+
+@pytest.mark.parametrize("outside_m", [0.4, 2.0])
+def test_it_says_how_far_beyond_the_limit_braking_would_end(outside_m: float) -> None:
+    bounds = replace(BOUNDS, outside_m=(outside_m,) * 3)
+    position_m = 3.0 + 0.5 * outside_m + 0.5 - 1.5  # braking takes 1.5 m
+    flight = WallObservation("ours", along(0, position_m), along(0, 1.0), ZERO, bounds, LIMITS, FALLBACK)
+    assert f"would end {0.5 * outside_m + 0.5:.1f} m beyond" in judge_wall(flight).text

@@ -202,6 +202,12 @@ def test_holding_begins_once_the_setpoint_is_what_is_held(
     assert after.held_ns == (5 * S + after_ns if wanted is HOLD else None)
 
 
+@pytest.mark.parametrize(("speed_mps", "wanted"), [(0.1, BRAKE), (math.nextafter(0.1, 0.0), HOLD)])
+def test_a_prediction_by_inputs_alone_is_braked_on_only_until_it_is_slow(speed_mps: float, wanted: ControlMode) -> None:
+    before, sent = Fallback(mode=BRAKE, since_ns=5 * S), (0.3, 0.0, 0.0)
+    assert advance_fallback(before, 5 * S, speed_mps, sent, PARAMETERS, is_open_loop=True).mode is wanted
+
+
 @pytest.mark.parametrize(
     ("is_blind", "hold_s", "blind_hold_s", "held_s"),
     [(False, 3.0, 0.5, 3.0), (True, 3.0, 0.5, 0.5), (True, 0.25, 0.5, 0.25), (False, 0.25, 0.5, 0.25)],

@@ -31,14 +31,19 @@ PLANT = small_plant()
 KALMAN = make_kalman(PLANT, estimator_parameters(), DT_NS)
 
 
-def watched(values: list[float], source: str = "camera", watches: SourceTracks | None = None) -> SourceTracks:
+def watched(
+    values: list[float],
+    source: str = "camera",
+    watches: SourceTracks | None = None,
+    off_m: tuple[float, ...] = (0.001,),
+) -> SourceTracks:
     """What is known of a source after these values, one each 50 ms, with what was off as 1 mm."""
     watches = watches or {}
     history = begin_history(KALMAN, START_NS, START_NS)
     for n, value in enumerate(values):
         one = sample(START_NS + (n + 1) * TICK_NS, position_m=(value, 0.0, 0.0), source=source)
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, ())
-        watches = track_sample(watches, KALMAN, history, one, np.array([0.001]))
+        watches = track_sample(watches, KALMAN, history, one, np.array(off_m))
         history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
         history = note_input(history, one.received_ns, np.array([1.0]))
     return watches
@@ -48,12 +53,15 @@ def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_
     watch = watched([0.0, 0.5, 0.25, 0.75])["camera"]
     assert (watch.resolution_m, watch.repeats, watch.open_loop_belief) == (0.25, 0, None)
     assert watch.noise_m == pytest.approx(0.001)
+    assert watched([0.0, 0.5, 0.25], off_m=(0.001, -0.003, 0.002))["camera"].noise_m == pytest.approx(0.003)
     assert (watch.changes, watch.first_ns) == (3, START_NS + 4 * TICK_NS)
     watch = watched([0.0, 0.5, 0.5, 0.5])["camera"]
     assert (watch.resolution_m, watch.repeats, watch.first_ns) == (0.5, 2, START_NS + 2 * TICK_NS)
     assert watch.open_loop_belief is not None
     assert watch.open_loop_belief.at_ns == watch.at_ns == START_NS + 4 * TICK_NS
     assert [is_repeat(watch, at_ns) for at_ns in (watch.at_ns, watch.at_ns - 1)] == [True, False]
+    watch = watched([0.0, 0.5, 0.5])["camera"]
+    assert watch.repeats == 1 and is_repeat(watch, watch.at_ns)
     watch = watched([0.0, 0.5, 0.5, 0.25])["camera"]
     assert (watch.repeats, watch.open_loop_belief) == (0, None)
     assert not is_repeat(watch, watch.at_ns)

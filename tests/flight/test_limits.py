@@ -45,6 +45,14 @@ def test_a_limit_itself_is_not_clamped() -> None:
     assert limit_setpoint((2.0, -2.0, 1.5), (1.5, -1.5, 1.0), TICK_S, LIMITS) == ((2.0, -2.0, 1.5), ())
 
 
+@pytest.mark.parametrize("want", [0.0, -0.0])
+def test_a_zero_keeps_its_sign_where_nothing_else_is_allowed(want: float) -> None:
+    """So a recording replays bit for bit."""
+    nothing = LimitsParameters(accel_mps2=ZERO, slew_mps3=0.0)
+    sent, limited = limit_setpoint((want, want, want), ZERO, TICK_S, nothing)
+    assert [math.copysign(1.0, value) for value in sent] == [math.copysign(1.0, want)] * 3 and not limited
+
+
 def test_a_change_is_limited_in_each_axis_from_both_sides() -> None:
     assert limit_setpoint((1.5, -1.5, 0.9), ZERO, TICK_S, LIMITS) == ((1.0, -1.0, 0.9), ("slew-north", "slew-east"))
     assert limit_setpoint((0.0, 0.0, -1.5), (0.0, 0.0, 1.5), TICK_S, LIMITS) == ((0.0, 0.0, 0.5), ("slew-down",))

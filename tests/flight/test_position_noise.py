@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
+from envelope_rig import just_more
 from hypothesis import given
 from hypothesis import strategies as st
 
 from uavctl.flight.monitors import jumps, noise
-from uavctl.flight.monitors.jumps import FADE_MPS, MAX_SHIFT_M, JumpTrack, Outcome
-from uavctl.flight.monitors.noise import LARGEST_STD_M, NoiseTrack
+from uavctl.flight.monitors.jumps import MAX_SHIFT_M, JumpTrack, Outcome
+from uavctl.flight.monitors.noise import NoiseTrack
 from uavctl.records import PositionSample, Vec3
 
 STEP_NS = 50_000_000
@@ -70,9 +72,34 @@ def test_a_jump_and_a_few_outliers_are_no_noise() -> None:
 def test_noise_is_bounded_and_needs_positions_close_to_one_another() -> None:
     rng = np.random.default_rng(3)
     wild = rng.standard_normal((30, 3))
-    assert measure_noise(wild).std_m == LARGEST_STD_M
+    assert measure_noise(wild).std_m == 0.1
     far = measure_noise(wild, step_ns=4 * STEP_NS)
     assert not far.is_known and far.std_m == 0.0
+
+
+@pytest.mark.parametrize(
+    ("before_ms", "after_ms", "counts"), [(50, 50, True), (20, 80, True), (40, 250, True), (40, 251, False)]
+)
+def test_a_position_is_compared_with_the_line_between_its_neighbours(
+    before_ms: int, after_ms: int, counts: bool
+) -> None:
+    """r = |p - p_line| / √(1 + (1 - c)² + c²), if both distances in time have a product of up to 0.01 s²."""
+    c = before_ms / (before_ms + after_ms)
+    begin, end, off = np.array([1.0, -2.0, 0.5]), np.array([2.0, 1.0, -1.0]), np.array([0.03, 0.04, 0.12])
+    track = NoiseTrack()
+    assert track.std_m == 0.0
+    for ms, place in ((0, begin), (before_ms, (1.0 - c) * begin + c * end + off), (before_ms + after_ms, end)):
+        north, east, down = place.tolist()
+        track = noise.update(track, make_sample(1 + ms * 1_000_000, (north, east, down)), 1 + ms * 1_000_000)
+    residual_m = 0.13 / math.sqrt(1.0 + (1.0 - c) ** 2 + c**2)
+    assert track.residuals_m == pytest.approx((residual_m,) if counts else ())
+
+
+def test_noise_counts_above_the_usual_one() -> None:
+    usual_m = 0.012 * 1.538  # median length of a residual
+    for residual_m, is_above in ((usual_m, False), (usual_m * (1.0 + 1e-12), True)):
+        track = noise.update(NoiseTrack(residuals_m=(residual_m,) * 15), make_sample(1, NONE), 1)
+        assert track.std_m == pytest.approx(0.012 if is_above else 0.0)
 
 
 @given(st.lists(st.tuples(st.integers(1, 40), st.floats(-0.2, 0.2)), min_size=10, max_size=40))
@@ -114,7 +141,7 @@ def test_a_shift_fades_to_nothing() -> None:
     track, _ = take(take(settle(), 30, JUMP)[0], 31, JUMP, 0.1)
     size_m = math.hypot(*JUMP)
     later = track.compute_shift_m(track.at_ns + 1_000_000_000)
-    assert math.hypot(*later) == pytest.approx(size_m - FADE_MPS)
+    assert math.hypot(*later) == pytest.approx(size_m - 0.05)
     assert track.compute_shift_m(track.at_ns + 60_000_000_000) == NONE
 
 
@@ -194,3 +221,70 @@ def test_no_positions_shift_by_more_than_so_much_and_no_three_are_refused_alike(
             n += 1
             assert math.hypot(*track.shift_m) <= MAX_SHIFT_M
         assert Outcome.TOO_FAR in outcomes or Outcome.COUNTS in outcomes
+
+
+def judge(
+    north_m: float, *, std_m: Vec3 = NONE, at_ns: int = 1, age_s: float = 0.0, **known: Any
+) -> tuple[JumpTrack, Outcome]:
+    """Take a position so far north of its prediction."""
+    return jumps.update(JumpTrack(**known), (north_m, 0.0, 0.0), np.array(std_m), at_ns, age_s)
+
+
+@pytest.mark.parametrize(
+    ("std_m", "age_s", "bound_m"),
+    [
+        ((0.01, 0.012, 0.013), 0.0, 0.07),
+        ((0.01, 0.03, 0.02), 0.0, 5.0 * 0.03),
+        (NONE, 0.2, 0.3 * 0.2 + 0.5 * 3.0 * 0.2 * 0.2),
+        (NONE, 1.0, 0.25),
+    ],
+)
+def test_a_position_beyond_each_bound_is_a_jump(std_m: Vec3, age_s: float, bound_m: float) -> None:
+    for sign in (1.0, -1.0):
+        assert judge(sign * bound_m, std_m=std_m, age_s=age_s)[1] is Outcome.COUNTS
+        assert judge(sign * just_more(bound_m), std_m=std_m, age_s=age_s)[1] is Outcome.REFUSED
+
+
+@pytest.mark.parametrize(
+    ("before_m", "is_jump"), [(0.1875 - 2.0**-10, True), (0.1875, True), (0.1875 + 2.0**-10, False)]
+)
+def test_an_offset_whose_change_was_three_quarters_there_before_has_grown(before_m: float, is_jump: bool) -> None:
+    _, outcome = judge(before_m + 0.25, offset_m=(before_m, 0.0, 0.0))
+    assert (outcome is Outcome.REFUSED) == is_jump
+
+
+@pytest.mark.parametrize(("jump_m", "confirms"), [(0.1875, True), (0.1875 - 2.0**-20, False)])
+def test_the_next_position_is_as_far_away_by_two_fifths(jump_m: float, confirms: bool) -> None:
+    track, outcome = judge(0.3125, jump_m=(jump_m, 0.0, 0.0))
+    assert (outcome, track.shift_m[0]) == ((Outcome.COUNTS, 0.25) if confirms else (Outcome.REFUSED, 0.0))
+
+
+def test_positions_are_shifted_by_two_fifths_of_a_metre_at_most() -> None:
+    for jump_m, outcome in ((0.4, Outcome.COUNTS), (just_more(0.4), Outcome.TOO_FAR)):
+        assert judge(jump_m, jump_m=(jump_m, 0.0, 0.0))[1] is outcome
+
+
+def test_a_shift_is_no_larger_before_its_time() -> None:
+    track = JumpTrack(shift_m=JUMP, at_ns=2_000_000_000)
+    assert track.compute_shift_m(1_000_000_000) == track.compute_shift_m(2_000_000_000) == JUMP
+
+
+@pytest.mark.parametrize(
+    ("gap_ns", "settles_ns"),
+    [(500_000_000, 0), (500_000_001, 500_000_001), (1_000_000_000, 1_000_000_000), (2_000_000_000, 1_000_000_000)],
+)
+def test_after_a_silence_positions_settle_for_as_long_again(gap_ns: int, settles_ns: int) -> None:
+    assert jumps.note_position(JumpTrack(), gap_ns).settled_ns == (gap_ns + settles_ns if settles_ns else 0)
+
+
+def test_jumps_are_judged_from_the_moment_on_that_is_settled() -> None:
+    for at_ns, age_s, outcome in (
+        (9, 0.0, Outcome.COUNTS),
+        (10, 0.0, Outcome.REFUSED),
+        (10, 1.5, Outcome.REFUSED),
+        (10, just_more(1.5), Outcome.COUNTS),
+    ):
+        assert judge(0.3, at_ns=at_ns, age_s=age_s, settled_ns=10)[1] is outcome
+    for at_ns, outcome in ((9, Outcome.COUNTS), (10, Outcome.REFUSED)):
+        suspended = jumps.suspend(JumpTrack(), 9)
+        assert jumps.update(suspended, (0.3, 0.0, 0.0), SPREAD, at_ns, 0.0)[1] is outcome

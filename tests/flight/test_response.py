@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from envelope_rig import PARAMETERS, motion, seen
+from envelope_rig import PARAMETERS, just_less, just_more, motion, seen, vec3
 from flight_rig import MS, START_NS
 from msgspec import structs
 
@@ -16,6 +16,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import response
 from uavctl.flight.monitors.motion import Motion, TickObservation
+from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.response import FAR, FAR_S, NEAR, WRONG, ResponseState
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
@@ -42,6 +43,7 @@ ROTATIONS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
 }
 ROOM = replace(PARAMETERS, unexplained_mps2=1.5)
 CONSISTENT = VelocityChangeState(agreed_ns=START_NS + round(SECONDS * 1e9))  # all the time
+INITIAL = VelocityChangeState()
 
 Flight = list[tuple[ResponseState, bool]]
 
@@ -213,7 +215,7 @@ def test_inertial_data_alone_prove_nothing() -> None:
         assert get_first_s(flight) is None and compute_evidence(flight[-1][0])[0] > FAR
 
 
-WITNESSED_MPS2 = response.WITNESSED_PART * ROOM.unexplained_mps2
+WITNESSED_MPS2 = 0.3 * ROOM.unexplained_mps2
 
 
 @pytest.mark.fault(101)
@@ -263,7 +265,7 @@ def test_it_is_found_with_less_evidence_where_a_wall_is_near(position_north_m: f
 
 def test_the_bound_is_met_at_a_second_before_the_last_moment_to_brake() -> None:
     speed_mps, brake_mps2 = 1.0, PARAMETERS.brake_mps2[0]
-    stop_m = speed_mps * (response.REACTION_S + speed_mps / (2.0 * brake_mps2))
+    stop_m = speed_mps * (0.3 + speed_mps / (2.0 * brake_mps2))
     for left_s, bound in (
         (0.0, NEAR),
         (0.5 * FAR_S, 0.5 * (NEAR + FAR)),
@@ -327,3 +329,314 @@ def test_an_own_velocity_shows_nothing_beside_inertial_data_or_right_after_anoth
         tick = seen(at_ns, vehicle_motion=motion(own, at_ns))
         after, _ = response.update(state, TickObservation(tick, Motion(), PARAMETERS), CONSISTENT)
         assert bool(after.samples) == is_sample
+
+
+# What each hypothesis says, written anew: R for setpoints now, so late [ns], and the cost of one near to a right one.
+RIGHT = [(gain, late_ns) for late_ns in (0, 150 * MS) for gain in (1.0, 0.7, 1.5)]
+
+
+def turn(degrees: float) -> np.ndarray:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, -s], [s, c]])
+
+
+WRONG_HORIZONTAL: dict[str, tuple[np.ndarray, int, float]] = {
+    "too late": (np.eye(2), 300 * MS, 0.0),
+    "turned by 90°": (turn(90.0), 0, 0.0),
+    "turned by 180°": (turn(180.0), 0, 0.0),
+    "turned by 270°": (turn(270.0), 0, 0.0),
+    "mirrored in north": (np.diag([-1.0, 1.0]), 0, 0.0),
+    "mirrored in east": (np.diag([1.0, -1.0]), 0, 0.0),
+    "not at all": (np.zeros((2, 2)), 0, 0.0),
+    "turned by 45°": (turn(45.0), 0, 1.0),
+    "turned by 315°": (turn(315.0), 0, 1.0),
+    "2.5 times as much": (2.5 * np.eye(2), 0, 1.0),
+}
+WRONG_VERTICAL: dict[str, tuple[np.ndarray, int, float]] = {
+    "too late": (np.eye(1), 300 * MS, 0.0),
+    "mirrored in down": (-np.eye(1), 0, 0.0),
+    "not at all in down": (np.zeros((1, 1)), 0, 0.0),
+}
+
+
+def find_least(cost: Callable[[float], float]) -> float:
+    """Find the least value of a parabola over a drag within 0 to 1.2 1/s."""
+    low, middle, high = (cost(drag_1ps) for drag_1ps in (0.0, 0.6, 1.2))
+    bend = low - 2.0 * middle + high
+    return min(low, high, cost(min(max(0.6 + 0.3 * (low - high) / bend, 0.0), 1.2)) if bend > 0.0 else low)
+
+
+def find_request(state: ResponseState, at_ns: int) -> Vec3:
+    """Find what setpoints gave at a time; before all, what they gave first."""
+    return next((u for ns, u in reversed(state.requested) if ns <= at_ns), state.requested[0][1])
+
+
+def compute_evidence_slowly(state: ResponseState, unexplained_mps2: float) -> tuple[float, str]:
+    """Compute the evidence by its definition, one hypothesis and one sample after the other."""
+    newest_ns, before = state.samples[-1][0], np.array(state.baseline) / state.baseline[0]
+    weights = np.array([one[0] * math.exp((at_ns - newest_ns) * 1e-9 / 0.4) for at_ns, one in state.samples])
+    count, weights = float(weights.sum()), weights / weights.sum()
+    best = 0.0, ""
+    for axes, wrong in (((0, 1), WRONG_HORIZONTAL), ((2,), WRONG_VERTICAL)):
+        one, chosen = np.eye(len(axes)), list(axes)
+
+        def compute_cost(r: np.ndarray, late_ns: int, dragged: bool = True, chosen: list[int] = chosen) -> float:
+            accel, now, velocity = (
+                np.array([row[k : k + 3] for _, row in state.samples])[:, chosen] for k in (1, 4, 7)
+            )
+            asked = [find_request(state, at_ns - late_ns) for at_ns, _ in state.samples]
+            u = np.array(asked)[:, chosen] if late_ns else now
+
+            def left(drag_1ps: float) -> np.ndarray:
+                return np.asarray(accel - u @ r.T + drag_1ps * velocity)
+
+            def vary(drag_1ps: float) -> float:
+                e = left(drag_1ps)
+                return float(weights @ ((e - weights @ e) ** 2).sum(axis=1))
+
+            def jump(drag_1ps: float) -> float:
+                e_before = before[1:4][chosen] + drag_1ps * before[4:7][chosen]
+                return float(((weights @ left(drag_1ps) - e_before) ** 2).sum())
+
+            variance, jumped = (find_least(f) if dragged else f(0.0) for f in (vary, jump))
+            noise, jumps = 0.2 * unexplained_mps2, 0.65 * unexplained_mps2
+            return 0.5 * count * math.log(1.0 + variance / noise**2) + 0.5 * jumped / jumps**2
+
+        if compute_cost(one, 0, dragged=False) <= 5.0:
+            continue
+        right = min(compute_cost(gain * one, late_ns) for gain, late_ns in RIGHT)
+        least, kind = min((compute_cost(r, late_ns) + cost, kind) for kind, (r, late_ns, cost) in wrong.items())
+        best = max(best, (right - least, kind))
+    return best
+
+
+def make_state(
+    rng: np.random.Generator, answers: tuple[np.ndarray, np.ndarray], late_ns: int, drag_1ps: float
+) -> ResponseState:
+    """Make the state after two seconds in which the vehicle answered so, with noise, drag and wind."""
+    rates, phases = rng.uniform(2.0, 4.0, 3), rng.uniform(0.0, 6.0, 3)
+    requested: list[tuple[int, Vec3]] = [
+        (START_NS + k * TICK_NS, vec3(2.0 * np.sin(rates * 0.05 * k + phases))) for k in range(41)
+    ]
+    r, wind, samples, recent = np.zeros((3, 3)), rng.normal(0.0, 0.5, 3), [], np.zeros(7)
+    r[:2, :2], r[2:, 2:] = answers
+    for k in range(1, 41, 2):  # the first ones from before the setpoints that are known
+        velocity, asked = rng.normal(0.0, 1.5, 3), np.array(requested[max(k - late_ns // TICK_NS, 0)][1])
+        accel = r @ asked - drag_1ps * velocity + wind + rng.normal(0.0, 0.1, 3)
+        weight, (at_ns, now) = float(rng.uniform(1.0, 2.0)), requested[k]
+        e = accel - now
+        recent += weight * math.exp(0.05 * (k - 39) / 0.4) * np.array([1.0, *e, *(e * e)])
+        samples.append((at_ns, tuple(map(float, (weight, *accel, *now, *velocity)))))
+    baseline = 30.0 * np.array([1.0, *rng.normal(0.0, 0.7, 6)])
+    return ResponseState(
+        requested=tuple(requested),
+        samples=tuple(samples),
+        recent=tuple(recent.tolist()),
+        baseline=tuple(baseline.tolist()),
+    )
+
+
+@pytest.mark.fault(101)
+@pytest.mark.parametrize("late_ns", [0, 150 * MS, 300 * MS])
+@pytest.mark.parametrize("kind", WRONG_HORIZONTAL)
+def test_the_evidence_is_that_of_its_definition(kind: str, late_ns: int) -> None:
+    """Blend a wrong response with a right one, of any gain, in both groups of axes or in one."""
+    rng = np.random.default_rng([*WRONG_HORIZONTAL].index(kind) + 10 * late_ns)
+    parts, gains = rng.uniform(0.5, 1.0, 2), rng.choice([0.3, 0.7, 1.0, 1.5, 1.8], 2)
+    wrong = WRONG_HORIZONTAL[kind][0], list(WRONG_VERTICAL.values())[rng.integers(3)][0]
+    blends = [p * r + (1.0 - p) * gain * np.eye(len(r)) for p, gain, r in zip(parts, gains, wrong, strict=True)]
+    for answers in ((blends[0], blends[1]), (blends[0], np.eye(1)), (np.eye(2), blends[1])):
+        state, unexplained_mps2 = make_state(rng, answers, late_ns, rng.uniform(0.0, 2.0)), rng.choice([0.6, 1.0, 1.5])
+        evidence, found = response.compute_evidence(state, unexplained_mps2)
+        slow, slow_found = compute_evidence_slowly(state, unexplained_mps2)
+        assert evidence == pytest.approx(slow, rel=1e-9)
+        assert found == slow_found
+
+
+UNIT_MPS2 = 1.0 / 0.65  # with it a jump of the wind has a standard deviation of 1 m/s²
+
+
+def make_little(means_mps2: Vec3, variances: Vec3, before_mps2: Vec3, count: float = 4.0) -> ResponseState:
+    """Make the state of a vehicle that answers the other way, with these sums of what an exact response leaves."""
+    state = make_state(np.random.default_rng(1), (-np.eye(2), -np.eye(1)), 0, 0.0)
+    squares = [variance + mean * mean for mean, variance in zip(means_mps2, variances, strict=True)]
+    return structs.replace(
+        state,
+        recent=tuple(count * x for x in (1.0, *means_mps2, *squares)),
+        baseline=tuple(2.0 * x for x in (1.0, *before_mps2, 0.0, 0.0, 0.0)),
+    )
+
+
+@pytest.mark.parametrize(("count", "finds"), [(4.0, True), (just_less(4.0), False)])
+def test_it_takes_four_samples(count: float, finds: bool) -> None:
+    state = make_little((9.0, 9.0, 9.0), ZERO, ZERO, count)
+    assert (response.compute_evidence(state, UNIT_MPS2)[0] > 0.0) == finds
+
+
+@pytest.mark.parametrize(
+    ("means_mps2", "finds"),
+    [
+        ((3.0, 1.0, 0.0), False),  # (3² + 1²) / 2 is 5
+        ((3.0, 1.0 + 1e-9, 0.0), True),
+        ((1.0, -3.0, 0.0), False),
+        ((0.0, 0.0, 3.1), False),
+        ((0.0, 0.0, -3.2), True),
+    ],
+)
+def test_no_other_is_compared_where_an_exact_response_leaves_little(means_mps2: Vec3, finds: bool) -> None:
+    evidence, _ = response.compute_evidence(make_little(means_mps2, ZERO, ZERO), UNIT_MPS2)
+    assert (evidence > 0.0) == finds
+
+
+@pytest.mark.parametrize("unexplained_mps2", [UNIT_MPS2, 0.8])
+@pytest.mark.parametrize("axes", [(0,), (1,), (0, 1), (2,)])
+def test_an_exact_response_leaves_a_variance_and_a_jump(axes: tuple[int, ...], unexplained_mps2: float) -> None:
+    """n / 2 ln(1 + V / σ²) + J / 2 σ_J² is just below 5, or just above."""
+    means, before, count = np.array([0.3, -0.5, 0.4]), np.array([0.1, 0.2, -0.3]), 6.0
+    before = np.where(np.isin(range(3), axes), before, means)
+    jumped = float(((means - before) ** 2).sum()) / (2.0 * (0.65 * unexplained_mps2) ** 2)
+    variance = (0.2 * unexplained_mps2) ** 2 * (math.exp(2.0 * (5.0 - jumped) / count) - 1.0)
+    for factor, finds in ((1.0 - 1e-9, False), (1.0 + 1e-9, True)):
+        variances = np.where(np.isin(range(3), axes), factor * variance / len(axes), 0.0)
+        state = make_little(vec3(means), vec3(variances), vec3(before), count)
+        assert (response.compute_evidence(state, unexplained_mps2)[0] > 0.0) == finds
+
+
+def observe(tick: Observation, observer: Observer | None = None) -> TickObservation:
+    return TickObservation(tick, Motion(observer=observer), ROOM)
+
+
+NOISE_FREE = Observer(START_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), inertial=np.zeros((3, 3)))
+FELT = structs.replace(seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), inertial_mps2=ZERO)
+SILENT = structs.replace(NOISE_FREE, at_ns=START_NS - 400 * MS - 1)
+
+
+def ends_plans(
+    monkeypatch: pytest.MonkeyPatch,
+    evidence: float,
+    tick: Observation,
+    observer: Observer | None,
+    change: VelocityChangeState = CONSISTENT,
+) -> bool:
+    monkeypatch.setattr(response, "compute_evidence", lambda *_: (evidence, "mirrored in north"))
+    begun = ResponseState(requested=((START_NS - TICK_NS, ZERO),), velocity=(START_NS - TICK_NS, ZERO))
+    _, verdict = response.update(begun, observe(tick, observer), change)
+    return not verdict.is_none
+
+
+@pytest.mark.parametrize(
+    ("tick", "observer", "change", "factor"),
+    [
+        (FELT, NOISE_FREE, CONSISTENT, 1.0),
+        (FELT, structs.replace(NOISE_FREE, at_ns=START_NS - 400 * MS), CONSISTENT, 1.0),
+        (FELT, SILENT, CONSISTENT, 3.0),
+        (FELT, None, CONSISTENT, 3.0),
+        (seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), NOISE_FREE, INITIAL, 3.0),  # no inertial data
+        (
+            structs.replace(FELT, motion=None),
+            structs.replace(NOISE_FREE, mean=np.array([ZERO, ZERO, (1.0, 0.0, 0.0)])),
+            INITIAL,
+            2.5,  # positions are the witness
+        ),
+    ],
+)
+@pytest.mark.parametrize(("north_m", "bound"), [(0.0, 3.0), (3.0, 1.4)])
+def test_plans_end_beyond_a_bound_by_what_is_witness_and_how_near_a_wall_is(
+    tick: Observation,
+    observer: Observer | None,
+    change: VelocityChangeState,
+    factor: float,
+    north_m: float,
+    bound: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tick = structs.replace(tick, position_m=(north_m, 0.0, -2.0), velocity_mps=(0.1, 0.0, 0.0))
+    limit = factor * bound
+    assert not ends_plans(monkeypatch, limit, tick, observer, change)
+    assert ends_plans(monkeypatch, just_more(limit), tick, observer, change)
+
+
+@pytest.mark.parametrize(
+    ("d_mps2", "inertial_mps2", "is_witness"),
+    [(0.3 * 1.5, 0.0, False), (just_more(0.3 * 1.5), 0.0, True), (2.0, 1.0, False), (just_more(2.0), 1.0, True)],
+)
+def test_positions_are_witness_beyond_a_bound(
+    d_mps2: float, inertial_mps2: float, is_witness: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observer = structs.replace(
+        NOISE_FREE,
+        mean=np.array([ZERO, ZERO, (d_mps2, 0.0, 0.0)]),
+        inertial=np.array([ZERO, ZERO, (inertial_mps2, 0.0, 0.0)]),
+    )
+    tick = structs.replace(FELT, motion=None)
+    assert ends_plans(monkeypatch, 99.0, tick, observer, INITIAL) == is_witness
+    assert not ends_plans(monkeypatch, 99.0, tick, structs.replace(observer, inertial=None), INITIAL)
+
+
+def test_sums_of_equal_samples_are_geometric_series() -> None:
+    """Σ w k^i is w (1 - k^n) / (1 - k), with k = e^(-Δt/τ)."""
+    state, n, w = ResponseState(requested=((START_NS - TICK_NS, (1.0, 0.5, -0.25)),)), 30, TICK_NS * 1e-9 / 0.05
+    for tick in range(n):
+        seen_now = structs.replace(
+            seen(START_NS + tick * TICK_NS), inertial_mps2=(3.0, 0.0, 0.25), velocity_mps=(0.5, math.nan, -2.0)
+        )
+        moved = Motion(model_mps2=(1.0, 0.5, -0.25))
+        state, _ = response.update(state, TickObservation(seen_now, moved, ROOM), VelocityChangeState())
+    short, long = (
+        w * (1.0 - math.exp(-n * 0.05 / memory_s)) / (1.0 - math.exp(-0.05 / memory_s)) for memory_s in (0.4, 10.0)
+    )
+    assert state.recent == pytest.approx([short * x for x in (1.0, 2.0, -0.5, 0.5, 4.0, 0.25, 0.25)])
+    assert state.baseline == pytest.approx([long * x for x in (1.0, 2.0, -0.5, 0.5, 0.5, 0.0, -2.0)])
+    sample = (w, 3.0, 0.0, 0.25, 1.0, 0.5, -0.25, 0.5, 0.0, -2.0)
+    assert [row for _, row in state.samples] == [pytest.approx(sample)] * n
+
+
+def test_samples_of_two_seconds_are_kept_and_setpoints_for_a_little_longer() -> None:
+    row = (1.0, *[0.0] * 9)
+    ages_ns = (2600 * MS, 2600 * MS - 1, 2000 * MS, 2000 * MS - 1)
+    state = ResponseState(
+        requested=tuple((START_NS - ns, ZERO) for ns in ages_ns),
+        samples=tuple((START_NS - ns, row) for ns in ages_ns),
+        inertial_ns=START_NS,
+    )
+    after, _ = response.update(state, observe(FELT), CONSISTENT)
+    assert [START_NS - ns for ns, _ in after.requested] == [*ages_ns[1:], 0]
+    assert [START_NS - ns for ns, _ in after.samples] == [ages_ns[3], 0]
+
+
+@pytest.mark.parametrize(
+    ("inertial_age_ms", "before_age_ms", "own_age_ms", "count"),
+    [
+        (None, 300, 0, 1),
+        (None, 301, 0, 0),
+        (300, 300, 0, 0),  # inertial data count for 0.3 s, too
+        (301, 300, 0, 1),
+        (None, 400, 300, 1),
+        (None, 400, 301, 0),  # the own velocity is too old
+    ],
+)
+def test_own_velocities_up_to_three_tenths_of_a_second_old_and_apart_show_an_acceleration(
+    inertial_age_ms: int | None, before_age_ms: int, own_age_ms: int, count: int
+) -> None:
+    state = ResponseState(
+        requested=((START_NS - TICK_NS, ZERO),),
+        velocity=(START_NS - before_age_ms * MS, ZERO),
+        inertial_ns=None if inertial_age_ms is None else START_NS - inertial_age_ms * MS,
+    )
+    own = motion((0.6, 0.0, 0.0), START_NS - own_age_ms * MS)
+    after, _ = response.update(state, observe(seen(START_NS, vehicle_motion=own)), CONSISTENT)
+    assert len(after.samples) == count
+    assert (after.velocity is None) == (own_age_ms > 300 or inertial_age_ms == 300)
+    if count:
+        middle_ns, row = after.samples[0]
+        assert middle_ns == START_NS - (before_age_ms + own_age_ms) * MS // 2
+        assert row[1] == pytest.approx(0.6 / (1e-3 * (before_age_ms - own_age_ms)))
+
+
+def test_a_vehicle_that_can_just_stop_overruns_nothing() -> None:
+    """x = v T + v² / 2 a, at 3 m/s with 2 m/s²."""
+    stop_m = 3.0 * 0.3 + 3.0**2 / (2.0 * 2.0)
+    tick = structs.replace(seen(START_NS), position_m=(0.0, 0.0, -2.0), velocity_mps=(3.0, 0.0, 0.0))
+    for upper_m, overruns in ((stop_m, False), (just_less(stop_m), True)):
+        parameters = replace(PARAMETERS, upper_m=(upper_m, 2.0, -1.0))
+        assert bool(response._describe_overrun(tick, parameters)) == overruns

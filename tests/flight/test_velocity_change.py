@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import pytest
-from envelope_rig import PARAMETERS, motion, seen
+from envelope_rig import PARAMETERS, just_more, motion, seen
 from flight_rig import MS, START_NS
 from msgspec import structs
 
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import Motion, TickObservation, update_motion
+from uavctl.flight.monitors.observer import InertialSpan, Observer
 from uavctl.flight.monitors.velocity import CORRECTS_NS, VelocityState
 from uavctl.flight.monitors.velocity_change import VelocityChangeState, update
 from uavctl.records import Vec3
@@ -210,3 +213,143 @@ def test_the_same_own_velocity_is_one_sample() -> None:
 )
 def test_what_differs_or_was_found_wrong_contradicts(state: VelocityChangeState, contradicts: bool) -> None:
     assert state.contradicts == contradicts
+
+
+HALF_S_NS = 500 * MS
+# Bounds after half a second without and with gusts: 0.25 m/s + 0.3 m/s² t, 0.25 m/s + 0.3 (2 m/s²) t
+AGREE_MPS, GUSTS_MPS = 0.25 + 0.3 * 0.5, 0.25 + 0.3 * 2.0 * 0.5
+
+
+def compare(
+    own: Vec3,
+    gained: Vec3,
+    *,
+    ns: int = HALF_S_NS,
+    model: Vec3 = ZERO,
+    pushed_mps2: Vec3 | None = None,
+    first: tuple[Vec3, Vec3, Vec3] = (ZERO, ZERO, ZERO),
+    **known: Any,
+) -> VelocityChangeState:
+    """Take one tick, `ns` after a first sample; until then velocities have become these.
+
+    Args:
+        pushed_mps2: Acceleration that positions showed beside setpoints; None before any position.
+        first: The sample: own velocity, integral of inertial data, that by setpoints.
+        known: State of the monitor. Both have differed since the first sample unless it says otherwise.
+    """
+    at_ns = START_NS + ns
+    observer = None
+    if pushed_mps2 is not None:
+        observer = Observer(at_ns, np.array([ZERO, ZERO, pushed_mps2]), np.zeros((3, 3)), np.zeros(3))
+    path = (InertialSpan(at_ns, ZERO, gained, ZERO),)
+    moved = Motion(tick_ns=at_ns, model_mps=model, inertial_path=path, observer=observer)
+    tick = structs.replace(seen(at_ns, vehicle_motion=motion(own, at_ns)), inertial_mps2=ZERO)
+    before: dict[str, Any] = {"samples": ((START_NS, *first),), "disagrees_ns": START_NS, **known}
+    return update(VelocityChangeState(**before), TickObservation(tick, moved, PARAMETERS), NO_POSITIONS)
+
+
+@pytest.mark.parametrize(("ns", "bound_mps"), [(HALF_S_NS, AGREE_MPS), (2 * HALF_S_NS, 0.25 + 0.3)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_changes_agree_up_to_a_bound_that_grows_with_time(ns: int, bound_mps: float, sign: float) -> None:
+    at_bound = compare(north(sign * bound_mps), ZERO, ns=ns)
+    assert (at_bound.agreed_ns, at_bound.disagrees_ns) == (START_NS + ns, None)
+    beyond = compare(ZERO, north(sign * just_more(bound_mps)), ns=ns, disagrees_ns=None)
+    assert (beyond.agreed_ns, beyond.disagrees_ns) == (None, START_NS + ns)
+
+
+@pytest.mark.parametrize(("for_ns", "finds"), [(50 * MS - 1, False), (50 * MS, True)])
+def test_a_disagreement_has_to_last(for_ns: int, finds: bool) -> None:
+    state = compare(north(1.0), ZERO, disagrees_ns=START_NS + HALF_S_NS - for_ns)
+    assert is_found(state) == (finds, False)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(
+    ("own", "gained", "pushed_mps2", "wrong"),
+    [
+        (0.5, -0.45, None, (True, False)),
+        (0.45, -0.5, None, (False, True)),
+        (0.5, -0.5, None, (True, False)),  # as far
+        (0.5, -0.45, 0.0, (True, False)),
+        (0.5, -0.45, 1.0, (False, True)),  # 1 m/s² makes 0.5 m/s
+        (0.7, 0.25, 1.0, (False, True)),  # the nearer of both counts
+    ],
+)
+def test_the_one_that_is_further_from_setpoints_with_or_without_a_push_is_wrong(
+    own: float, gained: float, pushed_mps2: float | None, wrong: tuple[bool, bool], axis: int
+) -> None:
+    def along(value: float) -> Vec3:
+        values = [0.0] * 3
+        values[axis] = value
+        return values[0], values[1], values[2]
+
+    state = compare(along(own), along(gained), pushed_mps2=None if pushed_mps2 is None else along(pushed_mps2))
+    assert is_found(state) == wrong
+
+
+def test_both_are_wrong_where_the_nearer_one_is_beyond_twice_the_gusts() -> None:
+    bound_mps = 2.0 * GUSTS_MPS
+    assert is_found(compare(north(bound_mps), north(-1.5 * bound_mps))) == (False, True)
+    assert is_found(compare(north(just_more(bound_mps)), north(-1.5 * bound_mps))) == (True, True)
+    # Once the own velocity was found wrong, inertial data alone are compared with that bound.
+    for gained_mps, is_wrong in ((bound_mps, False), (just_more(bound_mps), True)):
+        assert is_found(compare(ZERO, north(gained_mps), velocity_wrong_ns=START_NS)) == (True, is_wrong)
+
+
+def test_beside_wrong_inertial_data_gusts_bound_the_own_velocity() -> None:
+    for own_mps, is_wrong in ((GUSTS_MPS, False), (just_more(GUSTS_MPS), True)):
+        assert is_found(compare(north(own_mps), ZERO, inertial_wrong_ns=START_NS)) == (is_wrong, True)
+
+
+@pytest.mark.parametrize("wrong_ns", [None, START_NS])
+def test_the_velocity_at_the_begin_of_the_window_is_kept_where_the_own_one_is_wrong(wrong_ns: int | None) -> None:
+    first, model = (north(1.0), ZERO, north(0.25)), north(0.25)
+    wrong = compare(north(3.0), ZERO, first=first, model=model, inertial_wrong_ns=wrong_ns)
+    assert wrong.right_beside_model_mps == north(0.75)
+    right = compare(north(1.0), north(-2.0), first=first, model=model, inertial_wrong_ns=wrong_ns)
+    assert (is_found(right), right.right_beside_model_mps) == ((False, True), None)
+
+
+def test_samples_of_the_last_second_are_compared_each_once() -> None:
+    earlier = tuple((START_NS + ns, ZERO, ZERO, ZERO) for ns in (HALF_S_NS - 1, HALF_S_NS, 2 * HALF_S_NS))
+    state = compare(ZERO, ZERO, ns=3 * HALF_S_NS, samples=earlier)
+    assert [at_ns - START_NS for at_ns, *_ in state.samples] == [HALF_S_NS, 2 * HALF_S_NS, 3 * HALF_S_NS]
+    again = compare(ZERO, ZERO, ns=2 * HALF_S_NS, samples=earlier)
+    assert (again.samples, again.disagrees_ns) == (earlier, START_NS)
+
+
+def test_without_inertial_data_nothing_is_compared() -> None:
+    path = (InertialSpan(START_NS, ZERO, ZERO, ZERO),)
+    before = VelocityChangeState(samples=((START_NS - MS, ZERO, ZERO, ZERO),), disagrees_ns=START_NS)
+    tick = seen(START_NS, vehicle_motion=motion(ZERO, START_NS))
+    state = update(before, TickObservation(tick, Motion(inertial_path=path), PARAMETERS), NO_POSITIONS)
+    assert (state.samples, state.disagrees_ns) == ((), None)
+
+
+@pytest.mark.parametrize(
+    ("own_mps", "model_mps", "is_wrong"),
+    [
+        (0.0, 0.25, False),  # repeats
+        (0.0, just_more(0.25), True),
+        (0.25 + 0.375, 0.0, False),  # leaps within 62.5 ms
+        (just_more(0.25 + 0.375), 0.0, True),
+    ],
+)
+def test_a_velocity_may_repeat_and_leap_up_to_a_bound(own_mps: float, model_mps: float, is_wrong: bool) -> None:
+    at_ns = START_NS + 62_500_000
+    before = VelocityChangeState(repeated=(ZERO, ZERO, START_NS))
+    tick = seen(at_ns, vehicle_motion=motion(north(own_mps), at_ns))
+    state = update(before, TickObservation(tick, Motion(model_mps=north(model_mps)), PARAMETERS), NO_POSITIONS)
+    assert is_found(state) == (is_wrong, False)
+
+
+def test_times_and_bounds_count_to_the_last_nanosecond_and_bit() -> None:
+    agreed = VelocityChangeState(agreed_ns=START_NS)
+    assert agreed.supports_velocity(START_NS + 300 * MS) and not agreed.supports_velocity(START_NS + 300 * MS + 1)
+    for later_ns, is_wrong in ((3_000 * MS, True), (3_000 * MS + 1, False)):
+        tick = TickObservation(seen(START_NS + later_ns), Motion(), PARAMETERS)
+        assert is_found(update(VelocityChangeState(inertial_wrong_ns=START_NS), tick, NO_POSITIONS))[1] == is_wrong
+    for apart_mps, is_wrong in ((0.25, False), (just_more(0.25), True)):
+        positions = VelocityState(offsets=((START_NS + 1, ZERO),), apart_mps=apart_mps)
+        tick = TickObservation(seen(START_NS + MS), Motion(), PARAMETERS)
+        assert is_found(update(VelocityChangeState(velocity_wrong_ns=START_NS), tick, positions))[0] == is_wrong

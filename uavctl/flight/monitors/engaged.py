@@ -111,7 +111,7 @@ def _update_with_position(
 
 def _select_first(*verdicts: Verdict) -> Verdict:
     for verdict in verdicts:
-        if verdict is not NO_VERDICT and not verdict.is_none:
+        if not verdict.is_none:
             return verdict
     return NO_VERDICT
 
