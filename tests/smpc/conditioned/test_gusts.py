@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from uavctl.arrays import Array
 from uavctl.build.controller import build_problem
 from uavctl.config.load import load_config
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
+from uavctl.smpc.conditioned.backoffs import RowDeviations
 from uavctl.smpc.conditioned.planner import ConditionedSolver, make_level_choice
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.nominal import propagate_covariance
+from uavctl.smpc.nominal import find_parts, propagate_covariance
 
 ALLOWED, LOSS, STEPS, FIRST = 0.05, 0.3, 2200, 200
 WALL, CORNER = "[0, 19, 0]", "[19, 19, 0]"
@@ -65,6 +68,34 @@ def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapt
         mean = plant.a @ mean + plant.b @ u
         outside[k] = bool((rows @ x > sides).any())
     return outside
+
+
+def test_deviations_with_gusts_have_the_covariances_of_all_pairs_of_steps() -> None:
+    """Against the double sum over the steps; what white noise of the same variance lacks are its mixed terms."""
+    case, keep = make_solver(WALL).problem, 0.8
+    plant = case.plant
+    n_x, n_w = plant.n_x, plant.n_w
+    # (x, w): x+ = A x + B u + E w, w+ = φ w + n
+    gusts = replace(
+        plant,
+        a=np.block([[plant.a, plant.e], [np.zeros((n_w, n_x)), keep * np.eye(n_w)]]),
+        b=np.vstack([plant.b, np.zeros((n_w, plant.n_u))]),
+        e=np.vstack([np.zeros((n_x, n_w)), np.eye(n_w)]),
+        w=(1.0 - keep**2) * plant.w,
+        extra_states=(),
+    )
+    parts, unknown = find_parts(case), block_diag(np.zeros((n_x, n_x)), plant.w)
+    sigma = RowDeviations(case, parts, gusts).compute(unknown)
+    white = RowDeviations(case, parts, plant).compute(None)
+    rows = case.state_set.c[np.concatenate([part.rows_x for part in parts])]
+    effects = [rows @ np.linalg.matrix_power(plant.a, step) @ plant.e for step in range(case.horizon)]
+    for t in (1, 2, case.horizon):
+        # c'A^(t-1-i) E W E' A^(t-1-j)'c
+        pairs = np.array([[((effects[i] @ plant.w) * effects[j]).sum(axis=1) for j in range(t)] for i in range(t)])
+        lags = np.abs(np.subtract.outer(np.arange(t), np.arange(t)))
+        np.testing.assert_allclose(sigma[t - 1] ** 2, np.tensordot(keep**lags, pairs, axes=2), rtol=1e-9)
+        missing = 2.0 * np.tensordot(np.tril(keep**lags, -1), pairs, axes=2)
+        np.testing.assert_allclose(sigma[t - 1] ** 2 - white[t - 1] ** 2, missing, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
