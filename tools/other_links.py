@@ -4,7 +4,7 @@ The simulation is independent of `uavctl.lab`: own loop, links and disturbances 
 those of the paper, the target is 1 m from a wall in each axis. It prints, for each cell, the share of steps outside in
 the first 200 steps and after them, with its 95 % interval, and the mean cost of a step after them.
 
-    python tools/other_links.py [--axes 2] [--runs 8] [--steps 2200] [--seed 1] [--budgets configured]
+    python tools/other_links.py [--axes 2] [--runs 8] [--steps 2200] [--seed 1] [--budgets configured] [--cells AR]
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uavctl.arrays import Array
-from uavctl.smpc.answer import Answer, Preview
+from uavctl.smpc.answer import CERTIFICATE_LEVEL, Answer, Preview
 from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
 from uavctl.smpc.conditioned.planner import ConditionedSolver, make_level_choice
 from uavctl.smpc.link import bernoulli
@@ -116,9 +116,10 @@ def draw_noise(kind: str, shape: tuple[int, int], rng: np.random.Generator) -> A
 
 
 def fly(
-    solver: ConditionedSolver, cell: Cell, steps: int, rng: np.random.Generator, adapts: bool
+    solver: ConditionedSolver, cell: Cell, steps: int, rng: np.random.Generator, budgets: str
 ) -> tuple[Array, Array]:
-    """Fly one run; return the flags of steps outside and the cost of each step."""
+    """Fly one run by `risk.budgets`; return the flags of steps outside and the cost of each step."""
+    adapts = budgets != "configured"
     problem, plant = solver.problem, solver.problem.plant
     covs = propagate_covariance(plant, steps)
     choice, ages, loop = make_level_choice(solver, ALLOWED), AgeRecord(), LoopState()
@@ -153,7 +154,7 @@ def fly(
                 preview = Preview(
                     age=age,
                     cov=preview.cov,
-                    level=ages.level,
+                    level=ages.level if budgets == "observed" else CERTIFICATE_LEVEL,
                     widening=loop.widening,
                     silence_widening=loop.silence_widening,
                 )
@@ -177,14 +178,15 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--steps", type=int, default=2200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--budgets", choices=("observed", "configured"), default="observed")
+    parser.add_argument("--budgets", choices=("observed", "certificate", "configured"), default="observed")
+    parser.add_argument("--cells", default="", help="fly only cells with this in their names")
     given = parser.parse_args()
-    adapts = given.budgets == "observed"
+    adapts = given.budgets != "configured"
     solver = ConditionedSolver(make_problem(given.axes), bernoulli(np.array([0.7])), ALLOWED, has_lower_levels=adapts)
     sys.stdout.write(f"| cell | first {SETTLED} steps outside | after | cost |\n|---|---|---|---|\n")
-    for cell in CELLS:
+    for cell in (cell for cell in CELLS if given.cells in cell.name):
         runs = [
-            fly(solver, cell, given.steps, np.random.default_rng([given.seed, run]), adapts)
+            fly(solver, cell, given.steps, np.random.default_rng([given.seed, run]), given.budgets)
             for run in range(given.runs)
         ]
         early = np.mean([outside[:SETTLED].mean() for outside, _ in runs])

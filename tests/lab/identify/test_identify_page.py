@@ -70,6 +70,7 @@ def make_identification(*warnings: str) -> Identification:
         response=tuple(response(axis, r2) for axis, r2 in zip(AXES, (0.95, 0.9, 0.26), strict=True)),
         residual_std=(0.01,) * 3,
         r2=(0.95, 0.9, 0.26),
+        spreads=(),
         link={},
         warnings=warnings,
     )

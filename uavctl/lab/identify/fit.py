@@ -225,7 +225,7 @@ def _compute_slope(result: Likelihood) -> _Slope:
 AHEAD_S = (0.25, 0.5, 1.0, 2.0)
 R2_AHEAD_S = 1.0
 LAGS = 20
-_SETTLED_RATIO = 4.0  # over the median standard deviation; larger where a stretch begins, before the velocity is known
+SETTLED_RATIO = 4.0  # over the median standard deviation; larger where a stretch begins, before the velocity is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +275,7 @@ def predict(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> Prediction:
         innovations.append(result.innovations_m[1:])  # without the first, which is only its distance from zero
         stds.append(result.stds_m[1:])
     all_stds = np.concatenate(stds)
-    is_settled = all_stds < _SETTLED_RATIO * np.median(all_stds)
+    is_settled = all_stds < SETTLED_RATIO * np.median(all_stds)
     residuals = np.concatenate(innovations)[is_settled]
     (ahead,) = predict_ahead(flown, axis, fit, (R2_AHEAD_S,))
     return Prediction(
@@ -310,7 +310,7 @@ def _predict_ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[
     result = run_filter(axis_timeline, fit.model, parameters)
     motion = fit.model.motion(parameters[None])
     captured = axis_timeline.captured
-    is_settled = result.stds_m < _SETTLED_RATIO * np.median(result.stds_m)
+    is_settled = result.stds_m < SETTLED_RATIO * np.median(result.stds_m)
     predictions = []
     for time_s in ahead_s:
         later = np.searchsorted(captured, captured + round(time_s / TIME_UNIT_S))

@@ -67,6 +67,13 @@ def _make_sections(identification: Identification, positions: PositionHistory) -
         _draw_motion(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
     ]
     yield PageSection(f"Motion of the next {R2_AHEAD_S:g} s", _MOTION_NOTE, render_grid(drawings))
+    yield PageSection(
+        "Spread ahead",
+        _SPREAD_NOTE,
+        render_table(
+            _SPREAD_COLUMNS, _make_spread_rows(identification), frozenset(range(1, len(_SPREAD_COLUMNS))), kind="words"
+        ),
+    )
     innovation_drawings = [
         _draw_innovations(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
     ]
@@ -96,6 +103,12 @@ _DEAD_TIME_NOTE = (
     "above its least. The errors compare plants: fitted to one half of the flight and judged by the other, blocks of "
     "8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints known."
 )
+_SPREAD_COLUMNS = ("axis", "time ahead [s]", "σ [mm]", "spread", "spread by the configuration before")
+_SPREAD_NOTE = (
+    "How far positions were from their predictions over that time, divided by the standard deviation σ that plans keep "
+    "multiples of: 1 is right, above 1 plans come too near to limits. By the identified configuration, and by the one "
+    "before; both without inertial data."
+)
 _RESIDUAL_NOTE = (
     "Each position minus its prediction from those before: with a right model, 95 % are between the lines, and "
     "one does not tell the next (bars between the lines)."
@@ -115,6 +128,12 @@ def _make_response_rows(identification: Identification) -> Iterator[tuple[str, .
             f"{response.position_std_m * 1e3:.1f}",
             f"{response.r2:.3f}",
         )
+
+
+def _make_spread_rows(identification: Identification) -> Iterator[tuple[str, ...]]:
+    for row in identification.result.spreads:
+        configured = "–" if row.configured is None else f"{row.configured:.2f}"
+        yield row.axis, f"{row.ahead_s:g}", f"{1e3 * row.std_m:.1f}", f"{row.spread:.2f}", configured
 
 
 def _render_candidates(identification: Identification) -> Markup:

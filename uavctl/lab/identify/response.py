@@ -330,7 +330,7 @@ def compute_likelihood(parts: Sequence[Timeline], trials: Sequence[Trial]) -> tu
     motion = LinearMotion(
         *map(np.concatenate, zip(*(trial.model.motion(trial.parameters) for trial in trials), strict=True))
     )
-    noise_variance = np.concatenate([_get_noise_variance(trial.model, trial.parameters) for trial in trials])
+    noise_variance = np.concatenate([get_noise_variance(trial.model, trial.parameters) for trial in trials])
     passes = [_run_pass(part, axis_indices, motion, noise_variance, trials[0].model.start_std) for part in parts]
     bounds = np.cumsum([0, *counts])
 
@@ -350,11 +350,28 @@ def compute_likelihood(parts: Sequence[Timeline], trials: Sequence[Trial]) -> tu
 def run_filter(part: Timeline, model: AxisModel, parameters: Array) -> FilterResult:
     """Return states and innovations of one part's first axis under one parameter vector (l,)."""
     motion, axis_indices = model.motion(parameters[None]), np.zeros(1, dtype=np.int64)
-    result = _run_pass(part, axis_indices, motion, _get_noise_variance(model, parameters[None]), model.start_std)
+    result = _run_pass(part, axis_indices, motion, get_noise_variance(model, parameters[None]), model.start_std)
     driven = _compute_driven_states(part, axis_indices, motion)[:, 0]
     return FilterResult(
         driven, result.states[:, 0] - driven, result.innovations_m[:, 0], np.sqrt(result.variances_m2[:, 0])
     )
+
+
+def compute_covariances(part: Timeline, model: AxisModel, parameters: Array) -> Array:
+    """Return the covariance of the states after each position (m, n, n), under one parameter vector (l,)."""
+    lengths, index_of = part.spacings
+    transitions, _, noise_covs = compute_transition(model.motion(parameters[None]), lengths)
+    noise_m2 = float(get_noise_variance(model, parameters[None])[0])
+    cov = np.diag(np.square(model.start_std))
+    covs = np.empty((len(index_of) + 1, *cov.shape))
+    for index in range(len(covs)):
+        if index:
+            transition = transitions[index_of[index - 1], 0]
+            cov = transition @ cov @ transition.T + noise_covs[index_of[index - 1], 0]
+        # P = P - P c (c'P c + R)⁻¹ c'P
+        cov = cov - np.outer(cov[:, 0], cov[0]) / (cov[0, 0] + noise_m2)
+        covs[index] = cov
+    return covs
 
 
 def compute_transition(motion: LinearMotion, lengths: Counts) -> Transition:
@@ -399,7 +416,7 @@ def _compute_exponential(slope: Array, time_s: float) -> tuple[Array, Array]:
     return power, integral
 
 
-def _get_noise_variance(model: AxisModel, parameters: Array) -> Array:
+def get_noise_variance(model: AxisModel, parameters: Array) -> Array:
     """Return the variance of a position's noise (k,) [m²]."""
     return np.exp(2.0 * parameters[:, [parameter.name for parameter in model.free].index("noise_m")])
 

@@ -35,6 +35,7 @@ from uavctl.lab.identify.response import (
     ReferenceAxis,
     ramp_setpoints,
 )
+from uavctl.lab.identify.spread import Spread, describe_wide_spreads, make_spreads
 from uavctl.smpc.plant import AXES
 
 _QUANTILES = (0.0, 0.05, 0.5, 0.95, 0.99)
@@ -181,6 +182,7 @@ class Identified(msgspec.Struct, frozen=True, kw_only=True):
     response: tuple[AxisResponse, ...]
     residual_std: tuple[float, ...]
     r2: tuple[float, ...]
+    spreads: tuple[Spread, ...]  # of each axis and time ahead
     link: dict[str, object]
     warnings: tuple[str, ...]
 
@@ -234,8 +236,11 @@ def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None])
             identified_config,
             clock=msgspec.structs.replace(identified_config.clock, latency_s=round(history.latency_s, _DIGITS)),
         )
+    flown_s = sum(stretch.length_s for stretch in flown)
+    spreads = make_spreads(flown, axes, identified_config, config, ramp_s)
+    drift_key = "estimator.bias_drift" if chosen.name == DRAG_LAG else "plant.force_drift_mps2_rts"
     result = Identified(
-        flown_s=sum(stretch.length_s for stretch in flown),
+        flown_s=flown_s,
         positions=link.received,
         plant=_make_plant_section(identified_config),
         candidates=tuple(_make_candidate(response) for response in candidates),
@@ -243,8 +248,13 @@ def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None])
         response=responses,
         residual_std=tuple(response.residual_std_m for response in responses),
         r2=tuple(response.r2 for response in responses),
+        spreads=spreads,
         link=_make_link_section(link),
-        warnings=(*_describe_uncertain_axes(responses), *_describe_better_plants(chosen, candidates[1:])),
+        warnings=(
+            *_describe_uncertain_axes(responses),
+            *_describe_better_plants(chosen, candidates[1:]),
+            *describe_wide_spreads(spreads, flown_s, drift_key),
+        ),
     )
     return Identification(result, identified_config, link, tuple(predictions), flown, chosen.fits)
 
@@ -354,7 +364,7 @@ def _make_response(
         gain=None if is_reference else fit.value("gain"),
         wind_std_mps2=fit.value("wind_mps2_rts") / math.sqrt(dt_s),
         input_std_mps2=fit.value("input_mps2_rts") / math.sqrt(dt_s) if is_reference else None,
-        force_drift_mps2_rts=fit.value("drift_mps2_rts") if is_reference else None,
+        force_drift_mps2_rts=fit.value("drift_mps2_rts") if is_reference or _is_drifting(fit.model) else None,
         position_std_m=fit.value("noise_m"),
         lag_std_s=replace_infinite(errors["lag_s"]),
         drag_std_1ps=replace_infinite(errors["drag_1ps"]),
@@ -362,6 +372,10 @@ def _make_response(
         residual_std_m=prediction.residual_std_m,
         r2=prediction.r2,
     )
+
+
+def _is_drifting(model: AxisModel) -> bool:
+    return isinstance(model, DragLagAxis) and model.drifts
 
 
 def _describe_uncertain_axes(responses: Sequence[AxisResponse]) -> list[str]:
@@ -392,7 +406,9 @@ def _make_config(
         **{**dict.fromkeys(_MODEL_KEYS, ()), **_get_model_values(chosen, responses)},
     )
     estimator = msgspec.structs.replace(
-        config.estimator, position_std_m=round(max(response.position_std_m for response in responses), 6)
+        config.estimator,
+        position_std_m=round(max(response.position_std_m for response in responses), 6),
+        bias_drift=_find_bias_drift(config, chosen, responses),
     )
     # The design uses more than one position a step only if two come in a step, and one in the rest of it after the
     # delay. Else the rate is 0: one position a step.
@@ -408,6 +424,21 @@ def _make_config(
         source=source,
         link=msgspec.structs.replace(config.link, **_make_link_section(link)),
     )
+
+
+def _find_bias_drift(config: Config, chosen: ChosenPlant, responses: Sequence[AxisResponse]) -> float:
+    """Return the drift of the inputs' biases: the largest fitted one, and at least the configured one.
+
+    The fitted wind is what remains beside the drift, so the two belong together. A lower drift would thin the back-offs
+    by one calm flight, and slow the filter.
+    """
+    configured = config.estimator.bias_drift
+    if chosen.name != DRAG_LAG or not configured:
+        return configured
+    fitted = (
+        (response.force_drift_mps2_rts or 0.0) / gain for response in responses if (gain := response.gain) is not None
+    )
+    return max(configured, *(round(drift, _DIGITS) for drift in fitted))
 
 
 def _get_model_values(chosen: ChosenPlant, responses: Sequence[AxisResponse]) -> dict[str, tuple[float, ...]]:

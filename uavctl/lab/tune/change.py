@@ -367,6 +367,11 @@ def _make_noise_changes(config: Config, identification: Identification) -> Itera
     yield _raise_noise(
         "estimator.position_std_m", "", "m", config.estimator.position_std_m, fitted.estimator.position_std_m
     )
+    if config.estimator.bias_drift:
+        # The fitted wind is what remains beside the drift, so one is not raised without the other.
+        yield _raise_noise(
+            "estimator.bias_drift", "", "m/s² / √s", config.estimator.bias_drift, fitted.estimator.bias_drift
+        )
 
 
 def _make_link_changes(config: Config, link: LinkFit) -> Iterator[Change]:
@@ -452,7 +457,11 @@ def _apply_changes(config: Config, changes: tuple[Change, ...], link: LinkFit) -
         config,
         name=f"{config.name.removesuffix('-tuned')}-tuned",
         plant=plant,
-        estimator=replace(config.estimator, position_std_m=get_values("estimator.position_std_m")[0]),
+        estimator=replace(
+            config.estimator,
+            position_std_m=get_values("estimator.position_std_m")[0],
+            bias_drift=max((config.estimator.bias_drift, *get_values("estimator.bias_drift"))),
+        ),
         link=_make_worse_link(config, get_values("link.loss"), get_values("link.jitter_s"), link),
         cost=replace(config.cost, input=get_values("cost.input")),
     )
