@@ -65,6 +65,29 @@ def test_true_ones_agree_and_support_the_velocity() -> None:
     assert states[-1].supports_velocity(last_ns) and not states[-1].supports_velocity(last_ns + 301 * MS)
 
 
+@pytest.mark.fault(95)
+@pytest.mark.parametrize(
+    ("own", "supports"),
+    [
+        (true, True),
+        (lambda s, v: v + 0.4 * s, True),  # wind
+        (lambda s, v: v + 1.0 * s, False),
+        (lambda _s, v: 0.3 * v, False),
+        (lambda _s, v: -v, False),
+    ],
+)
+def test_without_inertial_data_setpoints_support_the_velocity(
+    own: Callable[[float, float], float], supports: bool
+) -> None:
+    states = fly(80, own, lambda _s, _a: None)
+    assert states[-1].supports_velocity(START_NS + 79 * TICK_NS) == supports
+    assert {is_found(state) for state in states} == {(False, False)}
+    # Over less than half a second they say nothing, nor beside a source that was found wrong.
+    assert all(state.agreed_ns is None for state in states[:10])
+    wrong = VelocityChangeState(inertial_wrong_ns=START_NS)
+    assert all(state.agreed_ns is None for state in fly(50, own, lambda _s, _a: None, state=wrong))
+
+
 @pytest.mark.fault(94)
 @pytest.mark.parametrize("begin_s", [LAG_S, LAG_S + 0.4])
 @pytest.mark.parametrize(
