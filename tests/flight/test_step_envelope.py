@@ -251,3 +251,47 @@ def test_a_silence_is_braked_on_the_last_own_velocity_that_was_right(right_mps: 
         if state.mode is not ControlMode.BRAKE:
             break
     assert state.plan.sent_mps2[0] * right_mps < 0.0
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("is_own", [True, False])
+@pytest.mark.parametrize(("push_mps2", "wanted_mps2"), [(0.4, -0.4), (-0.4, 0.4), (9.0, -1.0)])
+def test_a_silence_is_braked_against_the_push_that_the_own_velocity_shows(
+    push_mps2: float, wanted_mps2: float, is_own: bool
+) -> None:
+    ours, last = controller(), 5 + make_controller().horizon + 1
+    inputs = make_inputs(range((last + 5) * TICKS), make_step_samples(range(5, last + 1), steps=last + 5))
+    state = make_initial_state()
+    for inp in inputs[: last * TICKS]:
+        state, _ = run_tick(state, inp, ours)
+    for inp in inputs[last * TICKS :]:
+        shown = VelocityChangeState(agreed_ns=inp.at_ns, push_mps2=(push_mps2, 0.0, 0.0))
+        engaged = replace(state.monitors.engaged, velocity_change=shown)
+        state = replace(state, monitors=replace(state.monitors, engaged=engaged))
+        own = motion((0.0, 0.0, 0.0), inp.at_ns) if is_own else None
+        state, _ = run_tick(state, replace(inp, samples=(), motion=own), ours)
+    assert state.mode in (ControlMode.BRAKE, ControlMode.HOLD)
+    sent_mps2 = state.plan.sent_mps2[0]
+    assert (sent_mps2 == pytest.approx(wanted_mps2)) if is_own else abs(sent_mps2) < 0.3
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_prediction_that_is_not_braked_by_ends_no_flight(is_own: bool) -> None:
+    ours, first = changed(make_controller(), envelope=changed(ANYTHING, lower_m=(-1.0, -2.0, -4.0))), 8
+    inputs = make_inputs(range((first + 4) * TICKS), make_step_samples(range(first, first + 4), steps=first + 4))
+    state, begun = make_initial_state(), Fallback(mode=ControlMode.BRAKE, since_ns=START_NS)
+    for inp in inputs[: first * TICKS]:
+        state, _ = run_tick(state, inp, ours)
+    codes: set[str] = set()
+    outside = changed(ANYTHING, upper_m=(-9.0, 2.0, -1.0), lower_m=(-99.0, -2.0, -4.0))
+    for inp in inputs[first * TICKS :]:
+        state = replace(state, fallback=replace(state.fallback, flown=begun), plan=replace(state.plan, flown=None))
+        shown = replace(state.monitors.engaged, velocity_change=VelocityChangeState(agreed_ns=inp.at_ns))
+        state = replace(state, monitors=replace(state.monitors, engaged=shown))
+        own = motion((0.0, 0.0, 0.0), inp.at_ns) if is_own else None
+        age_steps = (inp.at_ns - inputs[first * TICKS].at_ns) // DT_NS
+        limits = outside if age_steps >= 2 else ANYTHING
+        state, output = run_tick(state, replace(inp, samples=(), motion=own), changed(ours, envelope=limits))
+        codes.update(event.code for event in output.events)
+    assert (EventCode.OUTSIDE in codes) != is_own

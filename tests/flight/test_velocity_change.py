@@ -68,6 +68,29 @@ def test_true_ones_agree_and_support_the_velocity() -> None:
     assert states[-1].supports_velocity(last_ns) and not states[-1].supports_velocity(last_ns + 301 * MS)
 
 
+@pytest.mark.fault(95)
+@pytest.mark.parametrize(
+    ("own", "supports"),
+    [
+        (true, True),
+        (lambda s, v: v + 0.4 * s, True),  # wind
+        (lambda s, v: v + 1.0 * s, False),
+        (lambda _s, v: 0.3 * v, False),
+        (lambda _s, v: -v, False),
+    ],
+)
+def test_without_inertial_data_setpoints_support_the_velocity(
+    own: Callable[[float, float], float], supports: bool
+) -> None:
+    states = fly(80, own, lambda _s, _a: None)
+    assert states[-1].supports_velocity(START_NS + 79 * TICK_NS) == supports
+    assert {is_found(state) for state in states} == {(False, False)}
+    # Over less than half a second they say nothing, nor beside a source that was found wrong.
+    assert all(state.agreed_ns is None for state in states[:10])
+    wrong = VelocityChangeState(inertial_wrong_ns=START_NS)
+    assert all(state.agreed_ns is None for state in fly(50, own, lambda _s, _a: None, state=wrong))
+
+
 @pytest.mark.fault(94)
 @pytest.mark.parametrize("begin_s", [LAG_S, LAG_S + 0.4])
 @pytest.mark.parametrize(
@@ -146,11 +169,24 @@ def test_the_velocity_before_the_lie_is_kept_with_what_setpoints_change_since(
     assert right is not None and right[0] + model_mps[0] == pytest.approx(SPEED_MPS + 0.05 * last * ACCEL[0], abs=0.3)
 
 
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(
+    ("push_mps2", "ticks", "shown_mps2"),
+    [(0.4, 42, 0.4), (-0.4, 42, 0.0), (-0.4, 100, -0.4), (0.4, 100, 0.0), (0.0, 100, 0.0)],
+)
+def test_the_push_is_what_neither_setpoints_nor_drag_explain(push_mps2: float, ticks: int, shown_mps2: float) -> None:
+    """After 42 ticks the vehicle moves north, after 100 south: drag would push against that."""
+    states = fly(ticks, lambda s, v: v + push_mps2 * s, true)
+    push = states[-1].push_mps2
+    assert push is not None and push[0] == pytest.approx(shown_mps2, abs=0.02)
+    assert all(state.push_mps2 is None for state in states[:10])
+
+
 def test_no_velocity_is_kept_while_the_own_one_is_right() -> None:
-    wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO)
+    wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO, push_mps2=ZERO)
     positions = VelocityState(offsets=((START_NS + 1, ZERO),), apart_mps=0.0)
     (state,) = fly(1, true, true, state=wrong, velocity=positions)
-    assert state.right_beside_model_mps is None
+    assert state.right_beside_model_mps is None and state.push_mps2 is None
     assert {one.right_beside_model_mps for one in fly(40, true, true)} == {None}
 
 

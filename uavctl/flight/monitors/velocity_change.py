@@ -2,11 +2,14 @@
 
 1. Over the last second, or since they last were compared, three changes of the velocity are known: of the vehicle's own
    velocity (Δv), the integral of its inertial data (Δi), and what the setpoints give (Δm). None needs a position.
-2. Δv and Δi that are near each other are both right: then positions that contradict them are wrong.
+2. Δv and Δi that are near each other are both right: then positions that contradict them are wrong. Without inertial
+   data, so is a Δv that is as near to Δm as gusts explain.
 3. Else the one that is further from Δm is wrong, with or without the acceleration d that positions showed last beside
    the setpoints; both are, if both are further than gusts explain. Where Δv is known to be wrong, only Δi is compared.
 4. An own velocity that repeats to the last bit while Δm grows is wrong, too. So is one that leaps from one message to
    the next by more than Δm and gusts explain. Once inertial data are known to be wrong, half as much is a proof.
+
+5. Δv - Δm over the time, without what drag explains, is the push that braking and holding fly against.
 
 A wrong velocity is not braked on, and wrong inertial data do not carry the estimate on. The own velocity that was right
 before is kept: with Δm it is the best that is known without a position. Where no position comes, the vehicle brakes
@@ -25,10 +28,13 @@ from collections.abc import Sequence
 from operator import itemgetter
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
+from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import TickObservation, bound_gusts_mps
 from uavctl.flight.monitors.observation import EnvelopeParameters, read_vehicle_velocity
+from uavctl.flight.monitors.observer import remove_drag
 from uavctl.flight.monitors.velocity import CORRECTS_NS, VelocityState
 from uavctl.records import Vector
 
@@ -36,6 +42,7 @@ WINDOW_NS = 1_000_000_000  # longer integrals of inertial data drift, over short
 PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one message may be late
 INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
+LEAST_NS = 500_000_000  # over less, setpoints alone say nothing of an own velocity
 RECENT_NS = 300_000_000  # an agreement counts for so long
 # Leap from one message to the next: a disagreement, and what a turned response makes of the largest setpoints. Where
 # inertial data were found wrong, nothing else checks the own velocity. Flights without a lie, recorded ones of real
@@ -43,7 +50,8 @@ RECENT_NS = 300_000_000  # an agreement counts for so long
 LEAP_MPS2, LONE_LEAP_MPS2 = 6.0, 3.0
 _TIME = itemgetter(0)  # of samples, oldest first
 
-Sample = tuple[int, Vector, Vector, Vector]  # time [ns]; own velocity, integral of inertial data, model's [m/s]
+# Time [ns]; own velocity, integral of inertial data (None without any), model's [m/s]
+Sample = tuple[int, Vector, Vector | None, Vector]
 
 
 class VelocityChangeState(msgspec.Struct, frozen=True):
@@ -57,6 +65,8 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
     # The last own velocity that was right, less the model's then [m/s]; None while the own velocity is right
     right_beside_model_mps: Vector | None = None
+    # Acceleration beside the setpoints that the own velocity has shown over the window, without drag; None before
+    push_mps2: Vector | None = None
 
     @property
     def has_found_wrong(self) -> bool:
@@ -83,16 +93,30 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     if own is None or own_ns is None or is_corrected:
         return replace(state, samples=(), disagrees_ns=None, repeated=None)
     state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
-    if not motion.inertial_path or tick.inertial_mps2 is None:
-        return replace(state, samples=(), disagrees_ns=None)
+    gained: Vector | None = None
+    if motion.inertial_path and tick.inertial_mps2 is not None:
+        gained = tuple(motion.inertial_path[-1].integrate(own_ns)[0])
+    if state.samples and (state.samples[-1][2] is None) != (gained is None):
+        state = replace(state, samples=(), disagrees_ns=None)
     if state.samples and state.samples[-1][0] >= own_ns:
         return state
-    gained, _ = motion.inertial_path[-1].integrate(own_ns)
     kept = state.samples[bisect_left(state.samples, own_ns - WINDOW_NS, key=_TIME) :]
-    sample = (own_ns, own, tuple(gained), motion.model_mps)
+    sample = (own_ns, own, gained, motion.model_mps)
     state = replace(state, samples=(*kept, sample))
+    if kept and own_ns - kept[0][0] >= LEAST_NS and state.velocity_wrong_ns is None:
+        state = replace(state, push_mps2=_find_push(state.samples))
     unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
     return _compare(state, kept[0] if kept else sample, sample, unexplained, tick.at_ns, parameters)
+
+
+def _find_push(samples: Sequence[Sample]) -> Vector:
+    """Find the mean acceleration (3,) [m/s²] beside the setpoints that the own velocity shows, without drag."""
+    first, last = samples[0], samples[-1]
+    s = (last[0] - first[0]) * 1e-9
+    # d = (Δv - Δm) / t
+    unexplained = [v / s for v in _subtract(_subtract(last[1], first[1]), _subtract(last[3], first[3]))]
+    mean_mps = [sum(values) / len(samples) for values in zip(*(own for _, own, _, _ in samples), strict=True)]
+    return tuple(remove_drag(np.array([ZERO, mean_mps, unexplained])).tolist())
 
 
 def _compare(
@@ -109,19 +133,24 @@ def _compare(
         unexplained_mps2: Acceleration that positions showed last beside the setpoints: wind and drag.
     """
     s = (last[0] - first[0]) * 1e-9
-    own, gained, model = [_subtract(now, then) for now, then in zip(last[1:], first[1:], strict=True)]
+    own, model = _subtract(last[1], first[1]), _subtract(last[3], first[3])
+    pushed = tuple(change + accel * s for change, accel in zip(model, unexplained_mps2, strict=True))
+    # e_v = min(|Δv - Δm|, |Δv - Δm - d t|): positions that were wrong have given a wrong d
+    own_mps = min(math.dist(own, model), math.dist(own, pushed))
+    # e > v_max + gusts(t), or twice that
+    gusts_mps = parameters.disagreement_mps + bound_gusts_mps(s, parameters)
+    explained_mps = 2.0 * gusts_mps
+    if first[2] is None or last[2] is None:
+        is_supported = s >= LEAST_NS * 1e-9 and own_mps <= gusts_mps and not state.has_found_wrong
+        return replace(state, agreed_ns=at_ns if is_supported else state.agreed_ns, disagrees_ns=None)
+    gained = _subtract(last[2], first[2])
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t
     if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
         return replace(state, agreed_ns=at_ns, disagrees_ns=None)
     disagrees_ns = at_ns if state.disagrees_ns is None else state.disagrees_ns
     if at_ns - disagrees_ns < PERSISTS_NS:
         return replace(state, disagrees_ns=disagrees_ns)
-    # e_v = min(|Δv - Δm|, |Δv - Δm - d t|), e_i likewise: positions that were wrong have given a wrong d
-    pushed = tuple(change + accel * s for change, accel in zip(model, unexplained_mps2, strict=True))
-    own_mps, gained_mps = (min(math.dist(shown, model), math.dist(shown, pushed)) for shown in (own, gained))
-    # e > v_max + gusts(t), or twice that
-    gusts_mps = parameters.disagreement_mps + bound_gusts_mps(s, parameters)
-    explained_mps = 2.0 * gusts_mps
+    gained_mps = min(math.dist(gained, model), math.dist(gained, pushed))
     right_mps = _subtract(first[1], first[3])
     if state.inertial_wrong_ns is not None:
         if state.velocity_wrong_ns is not None or own_mps <= gusts_mps:
@@ -176,7 +205,7 @@ def _believe_again(
     if not velocity.offsets or velocity.offsets[0][0] <= velocity_ns:
         return state
     if velocity.apart_mps <= parameters.disagreement_mps:
-        state = replace(state, velocity_wrong_ns=None, samples=(), right_beside_model_mps=None)
+        state = replace(state, velocity_wrong_ns=None, samples=(), right_beside_model_mps=None, push_mps2=None)
     return state
 
 
