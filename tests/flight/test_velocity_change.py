@@ -354,12 +354,12 @@ def test_samples_of_the_last_second_are_compared_each_once() -> None:
     assert (again.samples, again.disagrees_ns) == (earlier, START_NS)
 
 
-def test_without_inertial_data_nothing_is_compared() -> None:
+def test_a_sample_without_inertial_data_is_not_compared_with_those_before() -> None:
     path = (InertialSpan(START_NS, ZERO, ZERO, ZERO),)
     before = VelocityChangeState(samples=((START_NS - MS, ZERO, ZERO, ZERO),), disagrees_ns=START_NS)
     tick = seen(START_NS, vehicle_motion=motion(ZERO, START_NS))
     state = update(before, TickObservation(tick, Motion(inertial_path=path), PARAMETERS), NO_POSITIONS)
-    assert (state.samples, state.disagrees_ns) == ((), None)
+    assert (state.samples, state.disagrees_ns) == (((START_NS, ZERO, None, ZERO),), None)
 
 
 @pytest.mark.parametrize(
