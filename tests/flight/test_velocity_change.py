@@ -258,18 +258,19 @@ AGREE_MPS, GUSTS_MPS = 0.25 + 0.3 * 0.5, 0.25 + 0.3 * 2.0 * 0.5
 
 def compare(
     own: Vec3,
-    gained: Vec3,
+    gained: Vec3 | None,
     *,
     ns: int = HALF_S_NS,
     model: Vec3 = ZERO,
     pushed_mps2: Vec3 | None = None,
-    first: tuple[Vec3, Vec3, Vec3] = (ZERO, ZERO, ZERO),
+    first: tuple[Vec3, Vec3 | None, Vec3] = (ZERO, ZERO, ZERO),
     **known: Any,
 ) -> VelocityChangeState:
     """Take one tick, `ns` after a first sample; until then velocities have become these.
 
     Args:
         pushed_mps2: Acceleration that positions showed beside setpoints; None before any position.
+        gained: The integral of inertial data; None without any.
         first: The sample: own velocity, integral of inertial data, that by setpoints.
         known: State of the monitor. Both have differed since the first sample unless it says otherwise.
     """
@@ -277,9 +278,11 @@ def compare(
     observer = None
     if pushed_mps2 is not None:
         observer = Observer(at_ns, np.array([ZERO, ZERO, pushed_mps2]), np.zeros((3, 3)), np.zeros(3))
-    path = (InertialSpan(at_ns, ZERO, gained, ZERO),)
+    path = () if gained is None else (InertialSpan(at_ns, ZERO, gained, ZERO),)
     moved = Motion(tick_ns=at_ns, model_mps=model, inertial_path=path, observer=observer)
-    tick = structs.replace(seen(at_ns, vehicle_motion=motion(own, at_ns)), inertial_mps2=ZERO)
+    tick = structs.replace(
+        seen(at_ns, vehicle_motion=motion(own, at_ns)), inertial_mps2=None if gained is None else ZERO
+    )
     before: dict[str, Any] = {"samples": ((START_NS, *first),), "disagrees_ns": START_NS, **known}
     return update(VelocityChangeState(**before), TickObservation(tick, moved, PARAMETERS), NO_POSITIONS)
 
@@ -309,6 +312,7 @@ def test_a_disagreement_has_to_last(for_ns: int, finds: bool) -> None:
         (0.5, -0.45, 0.0, (True, False)),
         (0.5, -0.45, 1.0, (False, True)),  # 1 m/s² makes 0.5 m/s
         (0.7, 0.25, 1.0, (False, True)),  # the nearer of both counts
+        (-0.35, 0.25, 1.5, (True, False)),  # for inertial data, too
     ],
 )
 def test_the_one_that_is_further_from_setpoints_with_or_without_a_push_is_wrong(
@@ -344,6 +348,27 @@ def test_the_velocity_at_the_begin_of_the_window_is_kept_where_the_own_one_is_wr
     assert wrong.right_beside_model_mps == north(0.75)
     right = compare(north(1.0), north(-2.0), first=first, model=model, inertial_wrong_ns=wrong_ns)
     assert (is_found(right), right.right_beside_model_mps) == ((False, True), None)
+
+
+@pytest.mark.parametrize(
+    ("ns", "own_mps", "is_supported"),
+    [(HALF_S_NS, GUSTS_MPS, True), (HALF_S_NS, just_more(GUSTS_MPS), False), (HALF_S_NS - 1, 0.0, False)],
+)
+def test_setpoints_support_the_velocity_within_gusts_from_half_a_second_on(
+    ns: int, own_mps: float, is_supported: bool
+) -> None:
+    state = compare(north(own_mps), None, ns=ns, first=(ZERO, None, ZERO))
+    assert (state.agreed_ns == START_NS + ns) == is_supported and state.disagrees_ns is None
+
+
+def test_the_push_is_the_mean_over_the_window_less_the_largest_drag() -> None:
+    """The velocity changes by -4 m/s in 0.5 s, about a mean of 2 m/s: 8 m/s² less 1.2 1/s of drag are left."""
+    middle = (START_NS + 100 * MS, north(2.0), ZERO, ZERO)
+    samples = ((START_NS, north(4.0), ZERO, ZERO), middle)
+    state = compare(ZERO, ZERO, samples=samples)
+    assert state.push_mps2 == pytest.approx((-8.0 + 1.2 * 2.0, 0.0, 0.0))
+    early = compare(ZERO, ZERO, ns=HALF_S_NS - 1, samples=samples)
+    assert early.push_mps2 is None
 
 
 def test_samples_of_the_last_second_are_compared_each_once() -> None:
