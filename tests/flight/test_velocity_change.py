@@ -183,10 +183,10 @@ def test_the_push_is_what_neither_setpoints_nor_drag_explain(push_mps2: float, t
 
 
 def test_no_velocity_is_kept_while_the_own_one_is_right() -> None:
-    wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO, push_mps2=ZERO)
+    wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO)
     positions = VelocityState(offsets=((START_NS + 1, ZERO),), apart_mps=0.0)
     (state,) = fly(1, true, true, state=wrong, velocity=positions)
-    assert state.right_beside_model_mps is None and state.push_mps2 is None
+    assert state.right_beside_model_mps is None
     assert {one.right_beside_model_mps for one in fly(40, true, true)} == {None}
 
 

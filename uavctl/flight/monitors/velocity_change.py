@@ -103,7 +103,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     kept = state.samples[bisect_left(state.samples, own_ns - WINDOW_NS, key=_TIME) :]
     sample = (own_ns, own, gained, motion.model_mps)
     state = replace(state, samples=(*kept, sample))
-    if kept and own_ns - kept[0][0] >= LEAST_NS and state.velocity_wrong_ns is None:
+    if kept and own_ns - kept[0][0] >= LEAST_NS:
         state = replace(state, push_mps2=_find_push(state.samples))
     unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
     return _compare(state, kept[0] if kept else sample, sample, unexplained, tick.at_ns, parameters)
@@ -205,7 +205,7 @@ def _believe_again(
     if not velocity.offsets or velocity.offsets[0][0] <= velocity_ns:
         return state
     if velocity.apart_mps <= parameters.disagreement_mps:
-        state = replace(state, velocity_wrong_ns=None, samples=(), right_beside_model_mps=None, push_mps2=None)
+        state = replace(state, velocity_wrong_ns=None, samples=(), right_beside_model_mps=None)
     return state
 
 
