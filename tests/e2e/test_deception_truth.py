@@ -18,16 +18,14 @@ CAME_BACK = (53, 3051, 6004, 6019, 6021, 6035, 7006, 8083)
 WRONG_VELOCITY = (6054, 9046, 10189)
 # Seeds, plants and lies, each with its time after the blackout began. They were outside by 0.8 to 1.0 m: the first two
 # while the velocity to brake on was predicted since the last position, though the own one had been right since then;
-# the next two while positions were not compared with the own velocity where inertial data were distrusted, and one more
-# while they were not where no inertial data came. The last one drifted with the wind while it braked by its own
-# velocity.
+# the next two while positions were not compared with the own velocity where inertial data were distrusted, and the last
+# one while they were not where no inertial data came.
 AFTER_ANOTHER = (
     (30005, "quadrotor", (("attitude", "delayed", -0.8), ("velocity", "swapped", 0.7))),
     (30013, "quadrotor", (("attitude", "delayed", -0.8), ("velocity", "swapped", 0.7))),
     (30005, "quadrotor", (("positions", "scaled", 2.0),)),
     (30006, "linear", (("positions", "delayed", 2.0),)),
     (700004, "quadrotor", (("attitude", "frozen", -0.49), ("positions", "delayed", 3.16))),
-    (710014, "quadrotor", (("attitude", "flipped", 0.58),)),
 )
 WORST_LINEAR = (287, 290, 316, 323)  # of 71 flights of the linear plant, both autopilots
 

@@ -169,19 +169,6 @@ def test_the_velocity_before_the_lie_is_kept_with_what_setpoints_change_since(
     assert right is not None and right[0] + model_mps[0] == pytest.approx(SPEED_MPS + 0.05 * last * ACCEL[0], abs=0.3)
 
 
-@pytest.mark.fault(94)
-@pytest.mark.parametrize(
-    ("push_mps2", "ticks", "shown_mps2"),
-    [(0.4, 42, 0.4), (-0.4, 42, 0.0), (-0.4, 100, -0.4), (0.4, 100, 0.0), (0.0, 100, 0.0)],
-)
-def test_the_push_is_what_neither_setpoints_nor_drag_explain(push_mps2: float, ticks: int, shown_mps2: float) -> None:
-    """After 42 ticks the vehicle moves north, after 100 south: drag would push against that."""
-    states = fly(ticks, lambda s, v: v + push_mps2 * s, true)
-    push = states[-1].push_mps2
-    assert push is not None and push[0] == pytest.approx(shown_mps2, abs=0.02)
-    assert all(state.push_mps2 is None for state in states[:10])
-
-
 def test_no_velocity_is_kept_while_the_own_one_is_right() -> None:
     wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO)
     positions = VelocityState(offsets=((START_NS + 1, ZERO),), apart_mps=0.0)

@@ -53,7 +53,6 @@ COMPARED_NS = CORRECTS_NS + 400_000_000
 # show that they err. With five positions a second and 60 % of them lost, one in ten is older.
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
-MOST_PUSH_MPS2 = 1.0  # largest acceleration in any axis that holding flies against by the vehicle's own velocity
 _FINAL_TEXTS = {
     FallbackReason.VELOCITY_WRONG: "no position came, and the vehicle's own velocity was found wrong",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
@@ -346,8 +345,7 @@ def _fall_back(draft: Decided, fallback: Fallback, phase: _Phase, reason: str) -
     hold_point_m = None
     if fallback.mode is ControlMode.HOLD:
         hold_point_m = draft.hold_point_m
-        # The place of a prediction by inputs alone would be flown back to once positions come again.
-        if hold_point_m is None and carries_estimate(fallback, phase.view.belief):
+        if hold_point_m is None:
             hold_point_m = read_position(phase.view.estimate, phase.controller.plant)
     return replace(
         draft, plan=None, fallback=fallback, consecutive_samples=consecutive, hold_point_m=hold_point_m, reason=reason
@@ -416,10 +414,7 @@ def _is_inertial_new(belief: Belief | None) -> bool:
 
 
 def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, supervised: Supervised) -> Vec3:
-    """Find the setpoint [m/s²] at which the vehicle does not accelerate.
-
-    Against the push that its own velocity shows while nothing else is known, else the bias; zero where neither is.
-    """
+    """Find the setpoint [m/s²] at which the vehicle does not accelerate: against the bias, if known; else zero."""
     inputs, view = context.inputs, supervised.view
     bias = find_lasting_bias(biases)
     # Without positions, an estimated bias may be an error of the inertial data, and would be flown for seconds.
@@ -429,14 +424,7 @@ def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, su
         bias = view.estimate.bias
     # The vehicle keeps zero itself when nothing more is sent.
     is_last = fallback.is_final and fallback.mode is ControlMode.HOLD
-    if is_last or fallback.reason is FallbackReason.ENVELOPE:
-        return ZERO
-    push = supervised.monitors.engaged.velocity_change.push_mps2
-    is_alone = not fallback.is_final and not carries_estimate(fallback, view.belief)
-    if push is not None and is_alone and find_braking_velocity(context, supervised)[1]:
-        against_mps2 = [min(max(-a, -MOST_PUSH_MPS2), MOST_PUSH_MPS2) for a in push]
-        return _select_known(against_mps2, context.controller.plant)
-    if not bias:
+    if not bias or is_last or fallback.reason is FallbackReason.ENVELOPE:
         return ZERO
     # a = a(-d)
     north, east, down = context.controller.plant.to_accel(-np.array(bias))

@@ -298,25 +298,15 @@ def _update_engaged(
         is_braking=context.mode is ControlMode.BRAKE,
         inertial_mps2=None if reading is None else reading.accel_mps2,
     )
-    # A prediction that is so old, that the vehicle's own velocity contradicts, or that is not braked by, is compared
-    # with no limit.
+    # A prediction that is so old, or that the vehicle's own velocity contradicts, is compared with no limit.
     is_old = view.age_steps is None or view.age_steps >= context.controller.horizon
-    is_unused = _brakes_by_own_velocity(before.engaged, view, context)
-    if return_ordered or is_old or is_unused or not _judge_prediction(before.engaged, view, context).is_none:
+    if return_ordered or is_old or not _judge_prediction(before.engaged, view, context).is_none:
         observation = replace(observation, position_m=None)
     monitors = before.engaged
     starts = monitors.motion.began_ns is None
     if starts and before.unengaged.confirms_positions and reading is not None and not before.position_inconsistent:
         monitors = replace(monitors, agreed=True)
     return engaged.update(monitors, observation, bounds)
-
-
-def _brakes_by_own_velocity(monitors: MonitorState, view: FilterView, context: TickContext) -> bool:
-    """Whether the vehicle brakes or holds without a recent position, by its own velocity."""
-    if context.mode not in (ControlMode.BRAKE, ControlMode.HOLD) or (view.age_steps or 0) < PLAYED_OUT_STEPS:
-        return False
-    observation = observe_velocity(monitors, view.estimate, context)
-    return observation is not None and vehicle_velocity.find_trusted_velocity(observation) is not None
 
 
 def _judge_prediction(monitors: MonitorState, view: FilterView, context: TickContext) -> Verdict:

@@ -9,8 +9,6 @@
 4. An own velocity that repeats to the last bit while Δm grows is wrong, too. So is one that leaps from one message to
    the next by more than Δm and gusts explain. Once inertial data are known to be wrong, half as much is a proof.
 
-5. Δv - Δm over the time, without what drag explains, is the push that braking and holding fly against.
-
 A wrong velocity is not braked on, and wrong inertial data do not carry the estimate on. The own velocity that was right
 before is kept: with Δm it is the best that is known without a position. Where no position comes, the vehicle brakes
 (`uavctl.flight.supervise`). Wrong inertial data are compared again after three seconds, a wrong velocity
@@ -28,13 +26,10 @@ from collections.abc import Sequence
 from operator import itemgetter
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
-from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import TickObservation, bound_gusts_mps
 from uavctl.flight.monitors.observation import EnvelopeParameters, read_vehicle_velocity
-from uavctl.flight.monitors.observer import remove_drag
 from uavctl.flight.monitors.velocity import CORRECTS_NS, VelocityState
 from uavctl.records import Vector
 
@@ -42,7 +37,7 @@ WINDOW_NS = 1_000_000_000  # longer integrals of inertial data drift, over short
 PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one message may be late
 INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
-LEAST_NS = 500_000_000  # over less, setpoints alone say nothing of an own velocity
+LEAST_S = 0.5  # over less, setpoints alone say nothing of an own velocity
 RECENT_NS = 300_000_000  # an agreement counts for so long
 # Leap from one message to the next: a disagreement, and what a turned response makes of the largest setpoints. Where
 # inertial data were found wrong, nothing else checks the own velocity. Flights without a lie, recorded ones of real
@@ -65,8 +60,6 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
     # The last own velocity that was right, less the model's then [m/s]; None while the own velocity is right
     right_beside_model_mps: Vector | None = None
-    # Acceleration beside the setpoints that the own velocity has shown over the window, without drag; None before
-    push_mps2: Vector | None = None
 
     @property
     def has_found_wrong(self) -> bool:
@@ -103,20 +96,8 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     kept = state.samples[bisect_left(state.samples, own_ns - WINDOW_NS, key=_TIME) :]
     sample = (own_ns, own, gained, motion.model_mps)
     state = replace(state, samples=(*kept, sample))
-    if kept and own_ns - kept[0][0] >= LEAST_NS:
-        state = replace(state, push_mps2=_find_push(state.samples))
     unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
     return _compare(state, kept[0] if kept else sample, sample, unexplained, tick.at_ns, parameters)
-
-
-def _find_push(samples: Sequence[Sample]) -> Vector:
-    """Find the mean acceleration (3,) [m/s²] beside the setpoints that the own velocity shows, without drag."""
-    first, last = samples[0], samples[-1]
-    s = (last[0] - first[0]) * 1e-9
-    # d = (Δv - Δm) / t
-    unexplained = [v / s for v in _subtract(_subtract(last[1], first[1]), _subtract(last[3], first[3]))]
-    mean_mps = [sum(values) / len(samples) for values in zip(*(own for _, own, _, _ in samples), strict=True)]
-    return tuple(remove_drag(np.array([ZERO, mean_mps, unexplained])).tolist())
 
 
 def _compare(
@@ -141,7 +122,7 @@ def _compare(
     gusts_mps = parameters.disagreement_mps + bound_gusts_mps(s, parameters)
     explained_mps = 2.0 * gusts_mps
     if first[2] is None or last[2] is None:
-        is_supported = s >= LEAST_NS * 1e-9 and own_mps <= gusts_mps and not state.has_found_wrong
+        is_supported = s >= LEAST_S and own_mps <= gusts_mps and not state.has_found_wrong
         return replace(state, agreed_ns=at_ns if is_supported else state.agreed_ns, disagrees_ns=None)
     gained = _subtract(last[2], first[2])
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t
