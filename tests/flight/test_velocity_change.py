@@ -348,16 +348,6 @@ def test_setpoints_support_the_velocity_within_gusts_from_half_a_second_on(
     assert (state.agreed_ns == START_NS + ns) == is_supported and state.disagrees_ns is None
 
 
-def test_the_push_is_the_mean_over_the_window_less_the_largest_drag() -> None:
-    """The velocity changes by -4 m/s in 0.5 s, about a mean of 2 m/s: 8 m/s² less 1.2 1/s of drag are left."""
-    middle = (START_NS + 100 * MS, north(2.0), ZERO, ZERO)
-    samples = ((START_NS, north(4.0), ZERO, ZERO), middle)
-    state = compare(ZERO, ZERO, samples=samples)
-    assert state.push_mps2 == pytest.approx((-8.0 + 1.2 * 2.0, 0.0, 0.0))
-    early = compare(ZERO, ZERO, ns=HALF_S_NS - 1, samples=samples)
-    assert early.push_mps2 is None
-
-
 def test_samples_of_the_last_second_are_compared_each_once() -> None:
     earlier = tuple((START_NS + ns, ZERO, ZERO, ZERO) for ns in (HALF_S_NS - 1, HALF_S_NS, 2 * HALF_S_NS))
     state = compare(ZERO, ZERO, ns=3 * HALF_S_NS, samples=earlier)
