@@ -76,7 +76,7 @@ class ModelOutcome(StrEnum):
 
     HOLDS = "holds"  # nothing speaks against it
     CAUTIOUS = "cautious"  # errors were smaller than predicted, and that explains all else
-    REFUTED = "refuted"  # errors were larger than predicted, off on average, or told of the next by more than that
+    REFUTED = "refuted"  # errors were larger than predicted, off on average, or correlated by more than that
     UNKNOWN = "unknown"  # too few positions to say
 
 

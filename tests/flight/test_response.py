@@ -331,7 +331,7 @@ def test_an_own_velocity_shows_nothing_beside_inertial_data_or_right_after_anoth
         assert bool(after.samples) == is_sample
 
 
-# What each hypothesis says, written anew: R for setpoints now, so late [ns], and the cost of one near to a right one.
+# What each hypothesis says: R for setpoints now, so late [ns], and the cost of one near to a right one.
 RIGHT = [(gain, late_ns) for late_ns in (0, 150 * MS) for gain in (1.0, 0.7, 1.5)]
 
 
@@ -536,7 +536,7 @@ def ends_plans(
             structs.replace(FELT, motion=None),
             structs.replace(NOISE_FREE, mean=np.array([ZERO, ZERO, (1.0, 0.0, 0.0)])),
             INITIAL,
-            2.5,  # positions are the witness
+            2.5,  # positions show it
         ),
     ],
 )

@@ -11,7 +11,7 @@ from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.lab.identify.fit import AHEAD_S, fit_axes
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory, Stretch
-from uavctl.lab.identify.response import DragLagAxis, compute_covariances, make_parameters, make_timeline
+from uavctl.lab.identify.response import DragLagAxis, make_parameters, make_timeline, run_filter
 from uavctl.lab.identify.result import identify
 from uavctl.lab.identify.spread import Spread, compute_spread, describe_wide_spreads, measure_spreads
 from uavctl.smpc.conditioned.backoffs import RowDeviations
@@ -67,7 +67,7 @@ def test_deviations_ahead_are_those_of_the_back_offs() -> None:
     # (p, v, a, b) of the fit are (p, v, a + b, b / g) of the flight's filter, where a is all of the acceleration
     states = np.eye(4)
     states[2, 3], states[3, 3] = 1.0, 1.0 / VALUES["gain"]
-    cov = compute_covariances(make_timeline(stretch, (0,), 0.0), WALK, parameters)[-1]
+    cov = run_filter(make_timeline(stretch, (0,), 0.0), WALK, parameters).covs[-1]
     problem = ControlProblem(
         plant=PLANT,
         state_set=Polytope.from_box([-3.0, -1.5, -9.0], [3.0, 1.5, 9.0]),

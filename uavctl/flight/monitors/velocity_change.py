@@ -72,7 +72,7 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
         return self.has_found_wrong or self.disagrees_ns is not None
 
     def supports_velocity(self, at_ns: int) -> bool:
-        """Whether inertial data have changed as the own velocity has, just now."""
+        """Whether inertial data, or setpoints without any, have changed as the own velocity has, just now."""
         return self.velocity_wrong_ns is None and self.agreed_ns is not None and at_ns - self.agreed_ns <= RECENT_NS
 
 

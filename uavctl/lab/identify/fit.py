@@ -30,6 +30,7 @@ from uavctl.lab.identify.response import (
     OUTLIER,
     TIME_UNIT_S,
     AxisModel,
+    FilterResult,
     Likelihood,
     Timeline,
     Trial,
@@ -225,7 +226,18 @@ def _compute_slope(result: Likelihood) -> _Slope:
 AHEAD_S = (0.25, 0.5, 1.0, 2.0)
 R2_AHEAD_S = 1.0
 LAGS = 20
-SETTLED_RATIO = 4.0  # over the median standard deviation; larger where a stretch begins, before the velocity is known
+_SETTLED_RATIO = 4.0  # over the median standard deviation; larger where a stretch begins, before the velocity is known
+
+
+@dataclass(frozen=True, eq=False)
+class PositionsAhead:
+    """Predicted positions of a stretch, each a given time after another position."""
+
+    begins: NDArray[np.intp]  # (k,), index of the position that it is predicted from
+    later: NDArray[np.intp]  # (k,), index of the position that is predicted
+    predicted_m: Array  # (k,) [m]
+    rows: Array  # c'Φ (k, n): what the state at the begin adds to the position
+    noise_m2: Array  # c'N c (k,): variance that the noise since then adds
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +287,7 @@ def predict(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> Prediction:
         innovations.append(result.innovations_m[1:])  # without the first, which is only its distance from zero
         stds.append(result.stds_m[1:])
     all_stds = np.concatenate(stds)
-    is_settled = all_stds < SETTLED_RATIO * np.median(all_stds)
+    is_settled = all_stds < _SETTLED_RATIO * np.median(all_stds)
     residuals = np.concatenate(innovations)[is_settled]
     (ahead,) = predict_ahead(flown, axis, fit, (R2_AHEAD_S,))
     return Prediction(
@@ -306,27 +318,42 @@ def predict_ahead(
 
 def _predict_ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[float]) -> list[MotionAhead]:
     axis_timeline = make_timeline(stretch, (axis,), fit.dead_time_s)
-    parameters = np.array(fit.parameters)
+    parameters, positions_m = np.array(fit.parameters), axis_timeline.positions_m[:, 0]
     result = run_filter(axis_timeline, fit.model, parameters)
-    motion = fit.model.motion(parameters[None])
-    captured = axis_timeline.captured
-    is_settled = result.stds_m < SETTLED_RATIO * np.median(result.stds_m)
     predictions = []
     for time_s in ahead_s:
-        later = np.searchsorted(captured, captured + round(time_s / TIME_UNIT_S))
-        begins = np.flatnonzero(is_settled & (later < len(captured)))
-        later = later[begins]
-        lengths, lengths_index = np.unique(captured[later] - captured[begins], return_inverse=True)
-        rows = compute_transition(motion, lengths).transition[lengths_index, 0, 0]  # of the position
-        predicted = result.driven[later, 0] + np.einsum("kn,kn->k", rows, result.undriven[begins])
+        ahead = predict_positions(axis_timeline, result, fit.model, parameters, time_s)
+        begins, filtered_m = ahead.begins, result.driven[ahead.begins, 0] + result.undriven[ahead.begins, 0]
         predictions.append(
             MotionAhead(
-                times_s=stretch.times_s[0] + captured[begins] * TIME_UNIT_S,
-                moved_m=axis_timeline.positions_m[later, 0] - axis_timeline.positions_m[begins, 0],
-                predicted_m=predicted - result.driven[begins, 0] - result.undriven[begins, 0],
+                times_s=stretch.times_s[0] + axis_timeline.captured[begins] * TIME_UNIT_S,
+                moved_m=positions_m[ahead.later] - positions_m[begins],
+                predicted_m=ahead.predicted_m - filtered_m,
             )
         )
     return predictions
+
+
+def predict_positions(
+    part: Timeline, result: FilterResult, model: AxisModel, parameters: Array, time_s: float
+) -> PositionsAhead:
+    """Predict the first position at least a time after each one, where the filter has settled, with setpoints known."""
+    captured = part.captured
+    is_settled = result.stds_m < _SETTLED_RATIO * np.median(result.stds_m)
+    later = np.searchsorted(captured, captured + round(time_s / TIME_UNIT_S))
+    begins = np.flatnonzero(is_settled & (later < len(captured)))
+    later = later[begins]
+    lengths, index = np.unique(captured[later] - captured[begins], return_inverse=True)
+    transition = compute_transition(model.motion(parameters[None]), lengths)
+    # p = c'Φ x, the effect of the inputs apart
+    rows = transition.transition[index, 0, 0]
+    return PositionsAhead(
+        begins=begins,
+        later=later,
+        predicted_m=result.driven[later, 0] + np.einsum("kn,kn->k", rows, result.undriven[begins]),
+        rows=rows,
+        noise_m2=transition.noise_cov[index, 0, 0, 0],
+    )
 
 
 COARSE_S = tuple(round(0.04 * i, 2) for i in range(9))

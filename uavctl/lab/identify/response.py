@@ -277,6 +277,7 @@ class FilterResult:
     undriven: Array  # (m, n), corrected state minus `driven`
     innovations_m: Array  # (m,), position minus its prediction [m]
     stds_m: Array  # (m,), their standard deviations by the filter [m]
+    covs: Array  # (m, n, n), covariance of the corrected state
 
 
 class Trial(NamedTuple):
@@ -302,6 +303,7 @@ class FilterPass(NamedTuple):
     states: Array  # after the correction by each position (m, k, n)
     innovations_m: Array  # (m, k) [m]
     variances_m2: Array  # of the innovations (m, k) [m²]
+    covs: Array  # of the states (m, k, n, n)
 
 
 def make_timeline(stretch: Stretch, axes: Sequence[int], dead_time_s: float) -> Timeline:
@@ -353,25 +355,12 @@ def run_filter(part: Timeline, model: AxisModel, parameters: Array) -> FilterRes
     result = _run_pass(part, axis_indices, motion, get_noise_variance(model, parameters[None]), model.start_std)
     driven = _compute_driven_states(part, axis_indices, motion)[:, 0]
     return FilterResult(
-        driven, result.states[:, 0] - driven, result.innovations_m[:, 0], np.sqrt(result.variances_m2[:, 0])
+        driven,
+        result.states[:, 0] - driven,
+        result.innovations_m[:, 0],
+        np.sqrt(result.variances_m2[:, 0]),
+        result.covs[:, 0],
     )
-
-
-def compute_covariances(part: Timeline, model: AxisModel, parameters: Array) -> Array:
-    """Return the covariance of the states after each position (m, n, n), under one parameter vector (l,)."""
-    lengths, index_of = part.spacings
-    transitions, _, noise_covs = compute_transition(model.motion(parameters[None]), lengths)
-    noise_m2 = float(get_noise_variance(model, parameters[None])[0])
-    cov = np.diag(np.square(model.start_std))
-    covs = np.empty((len(index_of) + 1, *cov.shape))
-    for index in range(len(covs)):
-        if index:
-            transition = transitions[index_of[index - 1], 0]
-            cov = transition @ cov @ transition.T + noise_covs[index_of[index - 1], 0]
-        # P = P - P c (c'P c + R)⁻¹ c'P
-        cov = cov - np.outer(cov[:, 0], cov[0]) / (cov[0, 0] + noise_m2)
-        covs[index] = cov
-    return covs
 
 
 def compute_transition(motion: LinearMotion, lengths: Counts) -> Transition:
@@ -427,7 +416,7 @@ def _run_pass(
     """Run the filter over a part, for k parameter vectors of the axes `axis_indices` (k,)."""
     lengths, index_of = part.spacings
     transitions, _, noise_covs = compute_transition(motion, lengths)
-    gains, variances = _compute_gains(transitions, noise_covs, index_of, noise_variance, start_std)
+    gains, variances, covs = _compute_gains(transitions, noise_covs, index_of, noise_variance, start_std)
     input_effects = _compute_input_effects(part, axis_indices, motion)
     positions_m = part.positions_m[:, axis_indices]
     upper = OUTLIER * np.sqrt(variances)
@@ -447,17 +436,21 @@ def _run_pass(
         states[index] = state[:, :, 0]
     scaled = np.abs(innovations) / np.sqrt(variances)
     deviances = np.where(scaled < OUTLIER, scaled**2, OUTLIER * (2.0 * scaled - OUTLIER)) + np.log(variances)
-    return FilterPass(deviances[part.counts_for_fit].sum(axis=0), states, innovations, variances)
+    return FilterPass(deviances[part.counts_for_fit].sum(axis=0), states, innovations, variances, covs)
 
 
 def _compute_gains(
     transitions: Array, noise_covs: Array, index_of: Counts, noise_variance: Array, start_std: Sequence[float]
-) -> tuple[Array, Array]:
-    """Return gain (m, k, n) and variance of the innovation (m, k) at each position; they depend on the times alone."""
+) -> tuple[Array, Array, Array]:
+    """Return gain (m, k, n), variance of the innovation (m, k) and covariance after it (m, k, n, n) at each position.
+
+    They depend on the times alone.
+    """
     transposed = np.ascontiguousarray(transitions.swapaxes(-1, -2))
     size, count = len(start_std), len(noise_variance)
     cov = np.tile(np.diag(np.square(start_std)), (count, 1, 1))
     gains, variances = np.empty((len(index_of) + 1, count, size)), np.empty((len(index_of) + 1, count))
+    covs = np.empty((len(index_of) + 1, count, size, size))
     for index in range(len(index_of) + 1):
         if index:
             length_index = index_of[index - 1]
@@ -467,8 +460,10 @@ def _compute_gains(
         np.add(cov[:, 0, 0], noise_variance, out=variance)
         gain = gains[index]
         np.divide(cov[:, :, 0], variance[:, None], out=gain)
+        # P = P - K c'P
         cov = cov - gain[:, :, None] * cov[:, None, 0, :]
-    return gains, variances
+        covs[index] = cov
+    return gains, variances, covs
 
 
 def _compute_input_effects(part: Timeline, axis_indices: Counts, motion: LinearMotion) -> Array:

@@ -21,16 +21,13 @@ import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.config import Config
-from uavctl.lab.identify.fit import AHEAD_S, SETTLED_RATIO
+from uavctl.lab.identify.fit import AHEAD_S, predict_positions
 from uavctl.lab.identify.history import Stretch
 from uavctl.lab.identify.response import (
     DRAG_LAG,
-    TIME_UNIT_S,
     AxisModel,
     DragLagAxis,
     ReferenceAxis,
-    compute_covariances,
-    compute_transition,
     get_noise_variance,
     make_parameters,
     make_timeline,
@@ -77,24 +74,15 @@ def _measure_stretch(
     stretch: Stretch, axis: int, model: AxisModel, parameters: Array, dead_time_s: float, ahead_s: Sequence[float]
 ) -> list[tuple[Array, Array]]:
     timeline = make_timeline(stretch, (axis,), dead_time_s)
-    result, covs = run_filter(timeline, model, parameters), compute_covariances(timeline, model, parameters)
-    motion, noise_m2 = model.motion(parameters[None]), float(get_noise_variance(model, parameters[None])[0])
-    captured = timeline.captured
-    is_settled = result.stds_m < SETTLED_RATIO * np.median(result.stds_m)
+    result = run_filter(timeline, model, parameters)
+    noise_m2 = float(get_noise_variance(model, parameters[None])[0])
     pairs = []
     for time_s in ahead_s:
-        later = np.searchsorted(captured, captured + round(time_s / TIME_UNIT_S))
-        begins = np.flatnonzero(is_settled & (later < len(captured)))
-        later = later[begins]
-        lengths, lengths_index = np.unique(captured[later] - captured[begins], return_inverse=True)
-        transition = compute_transition(motion, lengths)
-        # p = c'Φ x, the effect of the inputs apart
-        rows = transition.transition[lengths_index, 0, 0]
-        predicted_m = result.driven[later, 0] + np.einsum("kn,kn->k", rows, result.undriven[begins])
+        ahead = predict_positions(timeline, result, model, parameters, time_s)
         # σ² = c'(Φ P Φ' + N)c + R
-        variance_m2 = np.einsum("kn,knm,km->k", rows, covs[begins], rows) + noise_m2
-        variance_m2 += transition.noise_cov[lengths_index, 0, 0, 0]
-        pairs.append((timeline.positions_m[later, 0] - predicted_m, np.sqrt(variance_m2)))
+        variance_m2 = np.einsum("kn,knm,km->k", ahead.rows, result.covs[ahead.begins], ahead.rows) + noise_m2
+        variance_m2 += ahead.noise_m2
+        pairs.append((timeline.positions_m[ahead.later, 0] - ahead.predicted_m, np.sqrt(variance_m2)))
     return pairs
 
 
