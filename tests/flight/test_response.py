@@ -14,7 +14,7 @@ from msgspec import structs
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
-from uavctl.flight.monitors import response
+from uavctl.flight.monitors import outside, response
 from uavctl.flight.monitors.motion import Motion, TickObservation
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import Observer
@@ -97,6 +97,7 @@ def fly(
             inertial_mps2=(float(shown[0]), float(shown[1]), answer_down(s)) if inertial else None,
             velocity_mps=own,
             position_m=position_m,
+            has_positions=silent_ns == 0,
         )
         observer = Observer(at_ns - silent_ns, beside, np.zeros((3, 3)), np.zeros(3), inertial=beside_inertial)
         model = Motion(model_mps2=(*requested(s), request_down(s)), observer=observer)
@@ -244,7 +245,7 @@ def test_positions_are_witness_where_no_own_velocity_comes(
 
 
 def test_it_takes_more_evidence_where_no_position_comes() -> None:
-    first_s = [get_first_s(fly(make_wrong("turned by 180°"), silent_ns=ns * MS)) for ns in (400, 401)]
+    first_s = [get_first_s(fly(make_wrong("turned by 180°"), silent_ns=ns * MS)) for ns in (0, 401)]
     assert first_s[0] is not None and first_s[1] is not None and first_s[0] < first_s[1]
 
 
@@ -298,7 +299,7 @@ def test_the_cause_says_where_the_speed_allowed_no_stop(north_m: float, north_mp
             position_m=(north_m, 0.0, -2.0),
             velocity_mps=(north_mps if own is None else 0.0, 0.0, 0.0),
         )
-        text = response._describe_overrun(tick, PARAMETERS)
+        text = outside.describe_overrun(tick, PARAMETERS)
         assert says in text if says else not text
 
 
@@ -508,7 +509,6 @@ def observe(tick: Observation, observer: Observer | None = None) -> TickObservat
 
 NOISE_FREE = Observer(START_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), inertial=np.zeros((3, 3)))
 FELT = structs.replace(seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), inertial_mps2=ZERO)
-SILENT = structs.replace(NOISE_FREE, at_ns=START_NS - 400 * MS - 1)
 
 
 def ends_plans(
@@ -517,43 +517,52 @@ def ends_plans(
     tick: Observation,
     observer: Observer | None,
     change: VelocityChangeState = CONSISTENT,
+    heard_ns: int | None = START_NS,
 ) -> bool:
     monkeypatch.setattr(response, "compute_evidence", lambda *_: (evidence, "mirrored in north"))
-    begun = ResponseState(requested=((START_NS - TICK_NS, ZERO),), velocity=(START_NS - TICK_NS, ZERO))
+    begun = ResponseState(
+        requested=((START_NS - TICK_NS, ZERO),), velocity=(START_NS - TICK_NS, ZERO), heard_ns=heard_ns
+    )
     _, verdict = response.update(begun, observe(tick, observer), change)
     return not verdict.is_none
 
 
 @pytest.mark.parametrize(
-    ("tick", "observer", "change", "factor"),
+    ("tick", "heard_ns", "observer", "change", "factor"),
     [
-        (FELT, NOISE_FREE, CONSISTENT, 1.0),
-        (FELT, structs.replace(NOISE_FREE, at_ns=START_NS - 400 * MS), CONSISTENT, 1.0),
-        (FELT, SILENT, CONSISTENT, 3.0),
-        (FELT, None, CONSISTENT, 3.0),
-        (seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), NOISE_FREE, INITIAL, 3.0),  # no inertial data
+        (FELT, START_NS, NOISE_FREE, CONSISTENT, 1.0),
+        (FELT, START_NS - 400 * MS, NOISE_FREE, CONSISTENT, 1.0),
+        (FELT, START_NS - 400 * MS - 1, NOISE_FREE, CONSISTENT, 3.0),
+        (structs.replace(FELT, has_positions=True), None, None, CONSISTENT, 1.0),  # none is believed
+        (FELT, None, NOISE_FREE, CONSISTENT, 3.0),
+        (seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), START_NS, NOISE_FREE, INITIAL, 3.0),  # no inertial data
         (
             structs.replace(FELT, motion=None),
+            START_NS,
             structs.replace(NOISE_FREE, mean=np.array([ZERO, ZERO, (1.0, 0.0, 0.0)])),
             INITIAL,
             2.5,  # positions show it
         ),
     ],
 )
-@pytest.mark.parametrize(("north_m", "bound"), [(0.0, 3.0), (3.0, 1.4)])
+@pytest.mark.parametrize(("north_m", "bound", "braking"), [(0.0, 3.0, False), (3.0, 1.4, False), (0.0, 3.0, True)])
 def test_plans_end_beyond_a_bound_by_what_is_witness_and_how_near_a_wall_is(
     tick: Observation,
+    heard_ns: int | None,
     observer: Observer | None,
     change: VelocityChangeState,
     factor: float,
     north_m: float,
     bound: float,
+    braking: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    tick = structs.replace(tick, position_m=(north_m, 0.0, -2.0), velocity_mps=(0.1, 0.0, 0.0))
-    limit = factor * bound
-    assert not ends_plans(monkeypatch, limit, tick, observer, change)
-    assert ends_plans(monkeypatch, just_more(limit), tick, observer, change)
+    tick = structs.replace(tick, position_m=(north_m, 0.0, -2.0), velocity_mps=(0.1, 0.0, 0.0), braking=braking)
+    is_silent = not tick.has_positions and (heard_ns is None or heard_ns < START_NS - 400 * MS)
+    # While the fallback brakes, and positions come, the least evidence is enough.
+    limit = factor * (NEAR if braking and not is_silent else bound)
+    assert not ends_plans(monkeypatch, limit, tick, observer, change, heard_ns)
+    assert ends_plans(monkeypatch, just_more(limit), tick, observer, change, heard_ns)
 
 
 @pytest.mark.parametrize(
@@ -634,9 +643,16 @@ def test_own_velocities_up_to_three_tenths_of_a_second_old_and_apart_show_an_acc
 
 
 def test_a_vehicle_that_can_just_stop_overruns_nothing() -> None:
-    """x = v T + v² / 2 a, at 3 m/s with 2 m/s²."""
-    stop_m = 3.0 * 0.3 + 3.0**2 / (2.0 * 2.0)
-    tick = structs.replace(seen(START_NS), position_m=(0.0, 0.0, -2.0), velocity_mps=(3.0, 0.0, 0.0))
+    """x = v T + v² / 2 a, at 3 m/s with 2 m/s²; with 4.5 m/s to the side the landing stops both."""
+    for east_mps, stop_m in (
+        (0.0, 3.0 * (0.3 + 3.0 / 2.0 / 2.0)),
+        (-4.5, 3.0 * (0.3 + math.hypot(3.0, 4.5) / (2.0 * 2.5))),
+    ):
+        check_overrun(east_mps, stop_m)
+
+
+def check_overrun(east_mps: float, stop_m: float) -> None:
+    tick = structs.replace(seen(START_NS), position_m=(0.0, 0.0, -2.0), velocity_mps=(3.0, east_mps, 0.0))
     for upper_m, overruns in ((stop_m, False), (just_less(stop_m), True)):
-        parameters = replace(PARAMETERS, upper_m=(upper_m, 2.0, -1.0))
-        assert bool(response._describe_overrun(tick, parameters)) == overruns
+        parameters = replace(PARAMETERS, lower_m=(-3.0, -999.0, -4.0), upper_m=(upper_m, 2.0, -1.0))
+        assert bool(outside.describe_overrun(tick, parameters)) == overruns

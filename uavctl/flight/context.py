@@ -143,6 +143,7 @@ def observe_motion(
         motion=context.inputs.motion,
         braking=is_braking,
         inertial_mps2=inertial_mps2,
+        has_positions=bool(context.inputs.samples),
     )
 
 

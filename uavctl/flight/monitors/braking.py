@@ -16,6 +16,7 @@ import msgspec
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import read_vehicle_velocity
+from uavctl.flight.monitors.outside import describe_overrun
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 
 EFFECT_NS = 1_000_000_000  # time after which braking must have reduced the speed
@@ -59,4 +60,4 @@ def update(
     if tick.at_ns - since_ns < EFFECT_NS or speed_mps <= MAX_SPEED_PART * began_mps + MAX_SPEED_MPS:
         return state, NO_VERDICT
     text = f"braking does not brake: {began_mps:.1f} m/s then, {speed_mps:.1f} m/s now"
-    return state, end_plans(EventCode.BRAKING, text)
+    return state, end_plans(EventCode.BRAKING, text + describe_overrun(tick, observation.parameters))

@@ -43,6 +43,7 @@ class Observation(msgspec.Struct, frozen=True):
     braking: bool  # whether the fallback brakes
     # Acceleration that the vehicle's inertial data show, local NED; None where none are recent
     inertial_mps2: Vec3 | None = None
+    has_positions: bool = False  # whether positions came in this tick, believed or not
 
 
 def select_axes(observation: Observation, parameters: EnvelopeParameters) -> Observation:

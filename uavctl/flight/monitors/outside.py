@@ -19,11 +19,15 @@ from uavctl.flight.limits import AXES
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, read_vehicle_velocity
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
+from uavctl.records import Vec3
 
 LASTS_NS = 100_000_000  # one estimate alone may be a late sample's fault
 RETURNS_MPS = 0.3  # a vehicle outside that moves so fast towards the limit is on its way back
 SIDEWAYS_MPS = 0.6  # upright climbs in gusts of 5 m/s came to 0.25 m/s
 REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
+LANDING_MPS2 = 2.5  # deceleration of a vehicle that brakes by itself, as recorded of ArduCopter
+
+_LIMITS = (("south", "north"), ("west", "east"), ("upper", "lower"))
 
 
 class OutsideState(msgspec.Struct, frozen=True):
@@ -93,3 +97,41 @@ def _describe_outside(observation: Observation, parameters: EnvelopeParameters, 
             if brakes and outward > 0.0 and out_m + stop_m > margin:
                 return f"the estimate leaves the limit of {axis} at {outward:.1f} m/s, faster than it can brake"
     return None
+
+
+def list_approaches(
+    tick: Observation, parameters: EnvelopeParameters, velocity_mps: Vec3
+) -> list[tuple[str, float, float, float]]:
+    """List the limits that the vehicle flies to: name, distance [m], speed [m/s], and deceleration [m/s²]."""
+    if tick.position_m is None:
+        return []
+    approaches = []
+    rows = zip(
+        _LIMITS,
+        tick.position_m,
+        velocity_mps,
+        parameters.lower_m,
+        parameters.upper_m,
+        parameters.brake_mps2,
+        strict=True,
+    )
+    for (below, above), position, velocity, lower, upper, brake in rows:
+        if velocity > 0.0:
+            approaches.append((above, upper - position, velocity, brake))
+        elif velocity < 0.0:
+            approaches.append((below, position - lower, -velocity, brake))
+    return approaches
+
+
+def describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
+    """Return in words the limits before which the vehicle cannot stop any more by its own landing; empty if none."""
+    text = ""
+    velocity_mps = read_vehicle_velocity(tick.motion, tick.at_ns) or tick.velocity_mps
+    speed_mps = math.hypot(*velocity_mps)
+    for limit, distance_m, approach_mps, brake_mps2 in list_approaches(tick, parameters, velocity_mps):
+        # All axes come to rest together: t = max(v_axis / a_axis, |v| / a); x < v_axis (T + t / 2)
+        stop_s = max(approach_mps / brake_mps2, speed_mps / LANDING_MPS2)
+        if distance_m < approach_mps * (REACTION_S + stop_s / 2.0):
+            place = f"{distance_m:.1f} m before" if distance_m > 0.0 else f"{-distance_m:.1f} m beyond"
+            text += f"; {place} the {limit} limit at {approach_mps:.1f} m/s, it could not stop in time"
+    return text

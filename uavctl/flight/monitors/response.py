@@ -9,7 +9,8 @@
    mean since the last seconds: a wind that sets in makes one, too. Older samples are forgotten.
 4. The evidence for a wrong response is the log-likelihood ratio of V and J against those of a right one. Where R = I
    leaves little, nothing else is compared.
-5. Evidence above a bound ends the plans. The bound is lower where little time is left to brake before a wall.
+5. Evidence above a bound ends the plans. The bound is lower where little time is left to brake before a wall, and
+   lowest while the fallback brakes and positions come: a wrong response would accelerate the vehicle for a second.
 6. Inertial data count only while the vehicle's own velocity changes as they do. Where no own velocity comes, positions
    are witness. Nothing counts while both sources contradict each other: one of them is wrong.
 
@@ -36,6 +37,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import MOTION_NS, EnvelopeParameters, Observation, read_vehicle_velocity
 from uavctl.flight.monitors.observer import DRAG_1PS, measure_size_mps2, remove_drag
+from uavctl.flight.monitors.outside import REACTION_S, describe_overrun, list_approaches
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vec3
@@ -53,21 +55,19 @@ FAR_S = 1.0
 # Cost of an exact response up to which no other is compared: a wrong one soon leaves more. In recorded flights it
 # delays a discovery by a tick or two at most, and nine of ten ticks of right responses end there.
 LITTLE = 5.0
-# Factor of the bounds for the vehicle's own velocity, which its estimator smooths, and without positions for so long:
+# Factor of the bounds for the vehicle's own velocity, which its estimator smooths, and with no position for so long:
 # inertial data and the own velocity that begin to err together would be taken for a wrong response.
 UNCERTAIN, SILENT_NS = 3.0, 400_000_000
 WITNESSED = 2.5  # the same where positions are the witness: sudden winds of 5 to 8 m/s² make evidence of up to 7.4
 # Of the acceleration that positions may show unexplained: from there on they are witness of inertial data. A choice:
 # more than noise of positions shows, less than a wrong response does in half a second.
 WITNESSED_PART = 0.3
-REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
 GAINS = (1.0, 0.7, 1.5)  # of a right response: the model of a vehicle is rarely exact
 LATE_NS, TOO_LATE_NS = 150_000_000, 300_000_000  # delays beyond the vehicle's lag: of a right response, of a wrong one
 RARE = 1.0  # cost of a response so near to a right one that wind or noise is taken for it sooner
 REQUESTED_NS = WINDOW_NS + TOO_LATE_NS + MOTION_NS  # setpoints are kept for so long
 
 _TIME = itemgetter(0)
-_LIMITS = (("south", "north"), ("west", "east"), ("upper", "lower"))
 
 # A sample: time [ns]; weight, then acceleration, that by setpoints, and velocity, each (3,)
 Sample = tuple[int, tuple[float, ...]]
@@ -121,6 +121,7 @@ class ResponseState(msgspec.Struct, frozen=True):
     """State of the monitor."""
 
     requested: tuple[tuple[int, Vec3], ...] = ()  # u of the last ticks, oldest first
+    heard_ns: int | None = None  # tick in which positions came last, believed or not [ns]; None before any
     inertial_ns: int | None = None  # tick of the newest inertial data [ns]; None before any
     velocity: tuple[int, Vec3] | None = None  # the vehicle's own velocity, without inertial data; None before any
     samples: tuple[Sample, ...] = ()  # of the window, oldest first
@@ -147,27 +148,30 @@ def update(
         change: State of the monitor that compares inertial data with the vehicle's own velocity, after this tick.
     """
     tick, (north, east, down) = observation.tick, observation.motion.model_mps2
+    heard_ns = tick.at_ns if tick.has_positions else state.heard_ns
     kept = state.requested[bisect_right(state.requested, tick.at_ns - REQUESTED_NS, key=_TIME) :]
-    state, shown = _find_acceleration(replace(state, requested=(*kept, (tick.at_ns, (north, east, down)))), tick)
+    state = replace(state, requested=(*kept, (tick.at_ns, (north, east, down))), heard_ns=heard_ns)
+    state, shown = _find_acceleration(state, tick)
     if change.contradicts:
-        return ResponseState(requested=state.requested), NO_VERDICT
+        return ResponseState(requested=state.requested, heard_ns=state.heard_ns), NO_VERDICT
     if shown is None:
         return state, NO_VERDICT
     state = _add_sample(state, shown, tick)
     by_inertial = tick.inertial_mps2 is not None
-    observer = observation.motion.observer
-    is_silent = observer is None or tick.at_ns - observer.at_ns > SILENT_NS
+    is_silent = state.heard_ns is None or tick.at_ns - state.heard_ns > SILENT_NS
     is_supported = change.supports_velocity(tick.at_ns)
-    if by_inertial and not is_supported and (is_silent or not _is_witnessed(observation)):
+    if by_inertial and not is_supported and not _is_witnessed(observation):
         return state, NO_VERDICT
     evidence, kind = compute_evidence(state, observation.parameters.unexplained_mps2)
     factor = UNCERTAIN
     if by_inertial and not is_silent:
         factor = 1.0 if is_supported else WITNESSED
-    if evidence <= factor * NEAR or evidence <= factor * _compute_bound(tick, observation.parameters):
+    is_urgent = tick.braking and not is_silent
+    bound = NEAR if is_urgent else _compute_bound(tick, observation.parameters)
+    if evidence <= factor * bound:
         return state, NO_VERDICT
     text = f"the vehicle does not answer setpoints as they say ({kind}), or a strong wind has set in"
-    return state, end_plans(EventCode.SETPOINT_RESPONSE, text + _describe_overrun(tick, observation.parameters))
+    return state, end_plans(EventCode.SETPOINT_RESPONSE, text + describe_overrun(tick, observation.parameters))
 
 
 def _is_witnessed(observation: TickObservation) -> bool:
@@ -177,6 +181,8 @@ def _is_witnessed(observation: TickObservation) -> bool:
     """
     tick, observer = observation.tick, observation.motion.observer
     if observer is None or observer.inertial is None or read_vehicle_velocity(tick.motion, tick.at_ns) is not None:
+        return False
+    if tick.at_ns - observer.at_ns > SILENT_NS:
         return False
     beside_sent_mps2, beside_inertial_mps2 = (
         measure_size_mps2(remove_drag(mean)) for mean in (observer.mean, observer.inertial)
@@ -190,7 +196,7 @@ def _find_acceleration(state: ResponseState, tick: Observation) -> tuple[Respons
     before_ns = state.requested[-2][0] if len(state.requested) > 1 else tick.at_ns
     if tick.inertial_mps2 is not None:
         if state.inertial_ns is None or tick.at_ns - state.inertial_ns > MOTION_NS:
-            state = ResponseState(requested=state.requested)
+            state = ResponseState(requested=state.requested, heard_ns=state.heard_ns)
         shown = _Acceleration(tick.at_ns, (tick.at_ns - before_ns) * 1e-9, tick.inertial_mps2)
         return replace(state, inertial_ns=tick.at_ns, velocity=None), shown
     own, motion = read_vehicle_velocity(tick.motion, tick.at_ns), tick.motion
@@ -199,7 +205,7 @@ def _find_acceleration(state: ResponseState, tick: Observation) -> tuple[Respons
         return replace(state, velocity=None), None
     before, now = state.velocity, (motion.velocity_ns, own)
     if before is None or now[0] - before[0] > MOTION_NS:
-        return ResponseState(requested=state.requested, velocity=now), None
+        return ResponseState(requested=state.requested, heard_ns=state.heard_ns, velocity=now), None
     span_s = (now[0] - before[0]) * 1e-9
     if span_s < CORRELATED_S:
         return state, None
@@ -316,43 +322,7 @@ def _remove_drag(left: float, with_velocity: float, speed: float) -> float:
 def _compute_bound(tick: Observation, parameters: EnvelopeParameters) -> float:
     """Compute the bound of the evidence, by the time that is left to brake before a wall."""
     left_s = FAR_S
-    for _, distance_m, speed_mps, brake_mps2 in _list_approaches(tick, parameters, tick.velocity_mps):
+    for _, distance_m, speed_mps, brake_mps2 in list_approaches(tick, parameters, tick.velocity_mps):
         # t = (x - v T - v² / 2 a) / v
         left_s = min(left_s, distance_m / speed_mps - REACTION_S - speed_mps / (2.0 * brake_mps2))
     return NEAR + (FAR - NEAR) * max(left_s, 0.0) / FAR_S
-
-
-def _list_approaches(
-    tick: Observation, parameters: EnvelopeParameters, velocity_mps: Vec3
-) -> list[tuple[str, float, float, float]]:
-    """List the limits that the vehicle flies to: name, distance [m], speed [m/s], and deceleration [m/s²]."""
-    if tick.position_m is None:
-        return []
-    approaches = []
-    rows = zip(
-        _LIMITS,
-        tick.position_m,
-        velocity_mps,
-        parameters.lower_m,
-        parameters.upper_m,
-        parameters.brake_mps2,
-        strict=True,
-    )
-    for (below, above), position, velocity, lower, upper, brake in rows:
-        if velocity > 0.0:
-            approaches.append((above, upper - position, velocity, brake))
-        elif velocity < 0.0:
-            approaches.append((below, position - lower, -velocity, brake))
-    return approaches
-
-
-def _describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
-    """Return in words the limits before which the vehicle cannot stop any more."""
-    text = ""
-    velocity_mps = read_vehicle_velocity(tick.motion, tick.at_ns) or tick.velocity_mps
-    for limit, distance_m, speed_mps, brake_mps2 in _list_approaches(tick, parameters, velocity_mps):
-        # x < v T + v² / 2 a
-        if distance_m < speed_mps * REACTION_S + speed_mps**2 / (2.0 * brake_mps2):
-            place = f"{distance_m:.1f} m before" if distance_m > 0.0 else f"{-distance_m:.1f} m beyond"
-            text += f"; {place} the {limit} limit at {speed_mps:.1f} m/s, it could not stop in time"
-    return text
