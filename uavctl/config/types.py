@@ -345,6 +345,13 @@ class RiskConfig(Section, frozen=True, kw_only=True):
             "nearer while less often, with `risk.budgets` `certificate` or `observed`"
         ),
     ] = True
+    from_first_position: Annotated[
+        bool,
+        Meta(
+            description="count the ages of positions from the first one on, also before the flight, and adapt slowly "
+            "where no limit is near; `false`, as in recordings of before: from the flight on, quickly everywhere"
+        ),
+    ] = True
 
 
 class SolverConfig(Section, frozen=True, kw_only=True):
