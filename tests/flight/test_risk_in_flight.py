@@ -165,15 +165,24 @@ def test_a_source_that_is_off_before_the_flight_says_nothing_of_the_link() -> No
     assert waited[-1].level > 0
 
 
-def test_by_default_and_in_recordings_of_before_the_budgets_are_the_configured_ones() -> None:
-    config = load_config("room")
+def test_by_default_the_budgets_follow_the_link_and_in_recordings_of_before_they_do_not() -> None:
+    assert load_config("room").risk == load_room().risk
+    assert build_controller(load_config("room-hahn-stursberg")).risk is None
+    keys = ("adapt =", "budgets =", "from_first_position =")
+    text = "\n".join(line for line in dump_config(load_config("room")).splitlines() if not line.startswith(keys))
+    config = parse_recorded(text, "recording").config
     design = build_conditioned(config)
     assert build_controller(config, design).risk is None
     assert len(design.solver.levels) == 1
+
+
+def test_a_recording_of_before_that_followed_the_link_flies_as_it_did() -> None:
     text = "\n".join(
-        line for line in dump_config(load_room()).splitlines() if not line.startswith(("adapt =", "budgets ="))
+        line for line in dump_config(load_room()).splitlines() if not line.startswith("from_first_position =")
     )
-    assert parse_recorded(text, "recording").config.risk == config.risk
+    risk = build_controller(parse_recorded(text, "recording").config).risk
+    assert risk is not None
+    assert (risk.budgets, risk.from_first_position) == ("observed", False)
 
 
 def test_saturation_is_an_event_when_it_begins() -> None:
