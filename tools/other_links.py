@@ -4,6 +4,9 @@ The simulation is independent of `uavctl.lab`: own loop, links and disturbances 
 those of the paper, the target is 1 m from a wall in each axis. It prints, for each cell, the share of steps outside in
 the first 200 steps and after them, with its 95 % interval, and the mean cost of a step after them.
 
+With `--before 600` the ages of so many steps before the flight are counted too, and further cells are flown whose link
+on the ground is another one.
+
     python tools/other_links.py [--axes 2] [--runs 8] [--steps 2200] [--seed 1] [--budgets configured] [--cells AR]
 """
 
@@ -37,6 +40,7 @@ class Cell:
     burst: float = 1.0  # mean length of a run of losses; 1: independent losses
     then: tuple[float, float] | None = None  # loss and burst of the second half
     late: int = 0  # steps that every position is late
+    before: tuple[float, float] | None = None  # loss and burst before the flight; None: as in its first half
     noise: str = "white"
 
 
@@ -55,6 +59,16 @@ CELLS = [
     Cell("30 %, AR(0.8)", noise="0.8"),
     Cell("30 %, t of 3", noise="t"),
     Cell("30 %, twice W", noise="twice"),
+]
+GROUND_CELLS = [
+    Cell(f"30 % on the ground, then {name}", loss, burst, before=(0.3, 1.0))
+    for name, loss, burst in (
+        ("60 %", 0.6, 1.0),
+        ("80 %", 0.8, 1.0),
+        ("bursts of 3", 0.3, 3.0),
+        ("bursts of 10", 0.3, 10.0),
+        ("60 %, bursts of 5", 0.6, 5.0),
+    )
 ]
 
 
@@ -116,7 +130,7 @@ def draw_noise(kind: str, shape: tuple[int, int], rng: np.random.Generator) -> A
 
 
 def fly(
-    solver: ConditionedSolver, cell: Cell, steps: int, rng: np.random.Generator, budgets: str
+    solver: ConditionedSolver, cell: Cell, steps: int, rng: np.random.Generator, budgets: str, steps_before: int = 0
 ) -> tuple[Array, Array]:
     """Fly one run by `risk.budgets`; return the flags of steps outside and the cost of each step."""
     adapts = budgets != "configured"
@@ -127,6 +141,10 @@ def fly(
     if cell.then is not None:
         arrived[steps // 2 :] = draw_arrivals(*cell.then, steps - steps // 2, rng)
     noise = math.sqrt(plant.w[0, 0]) * draw_noise(cell.noise, (steps, plant.n_w), rng)
+    if steps_before:
+        silence = 0
+        for is_there in draw_arrivals(*(cell.before or (cell.loss, cell.burst)), steps_before, rng):
+            ages, silence = count_age(ages, silence + 1, choice), 0 if is_there else silence + 1
     lower, upper = problem.input_set.bounds
     rows, sides, target = problem.state_set.c, problem.state_set.b, problem.target
     x = target - np.array([2.0, 0.0] * plant.n_u)
@@ -179,14 +197,16 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--budgets", choices=("observed", "certificate", "configured"), default="observed")
+    parser.add_argument("--before", type=int, default=0, help="steps before the flight whose ages count")
     parser.add_argument("--cells", default="", help="fly only cells with this in their names")
     given = parser.parse_args()
     adapts = given.budgets != "configured"
     solver = ConditionedSolver(make_problem(given.axes), bernoulli(np.array([0.7])), ALLOWED, has_lower_levels=adapts)
     sys.stdout.write(f"| cell | first {SETTLED} steps outside | after | cost |\n|---|---|---|---|\n")
-    for cell in (cell for cell in CELLS if given.cells in cell.name):
+    cells = (*CELLS, *(GROUND_CELLS if given.before else ()))
+    for cell in (cell for cell in cells if given.cells in cell.name):
         runs = [
-            fly(solver, cell, given.steps, np.random.default_rng([given.seed, run]), given.budgets)
+            fly(solver, cell, given.steps, np.random.default_rng([given.seed, run]), given.budgets, given.before)
             for run in range(given.runs)
         ]
         early = np.mean([outside[:SETTLED].mean() for outside, _ in runs])

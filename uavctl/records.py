@@ -425,7 +425,8 @@ class RiskRecord(Record, frozen=True, kw_only=True):
     """Risk of the step that ends at a Δt boundary, and what the next plan is made with."""
 
     age: int  # age of the information that moved the vehicle here [steps], from 1 on
-    outside: float  # probability that the vehicle is outside of its limits, given all that is known
+    # Probability that the vehicle is outside of its limits, given all that is known; None while it is not flown
+    outside: float | None
     level: int  # level of the budgets; 0: the certificate, which holds on any link
     contradicts: bool  # whether the link as observed contradicts the configured one
     widening: float  # factor of all standard deviations

@@ -29,23 +29,33 @@ def load_room(*overrides: str) -> Config:
     return load_config("room", ["target.position_m=[2.9, 0, -1.2]", "risk.budgets=observed", *overrides])
 
 
-def fly(config: Config, seed: int) -> tuple[list[StepInput], list[TickOutput]]:
-    """Fly from 0.5 m beside the target, with runs of five lost positions in the mean."""
+def fly(
+    config: Config, seed: int, ground_ticks: int = 0, loss: tuple[float, float] = (0.1, 0.8), silent: range = range(0)
+) -> tuple[list[StepInput], list[TickOutput]]:
+    """Fly from 0.5 m beside the target, with runs of five lost positions in the mean.
+
+    Args:
+        ground_ticks: Ticks before the flight, with the same link.
+        loss: Probability that a position is lost after one that came, and after one that was lost.
+        silent: Ticks without any position.
+    """
     controller, rng = build_controller(config), np.random.default_rng(seed)
     plant, state, inputs, outputs = controller.plant, make_initial_state(), [], []
     x, is_bad = plant.equilibrium((2.4, 0.0, -1.2)), False
     waiting = []
-    for tick in range(STEPS):
+    for tick in range(ground_ticks + STEPS):
         at_ns = START_NS + tick * controller.tick_ns
-        is_bad = bool(rng.random() < (0.8 if is_bad else 0.1))
-        if not is_bad:
+        is_bad = bool(rng.random() < loss[is_bad])
+        if not is_bad and tick not in silent:
             position = x[list(plant.position_index)] + rng.normal(scale=0.003, size=3)
             waiting.append(sample(at_ns + MS, at_ns + 40 * MS, tuple(position.tolist())))
         arrived = tuple(one for one in waiting if one.received_ns <= at_ns)
         waiting = [one for one in waiting if one.received_ns > at_ns]
-        inputs.append(StepInput(tick=tick, at_ns=at_ns, samples=arrived, vehicle=vehicle()))
+        inputs.append(StepInput(tick=tick, at_ns=at_ns, samples=arrived, vehicle=vehicle(armed=tick >= ground_ticks)))
         state, output = run_tick(state, inputs[-1], controller)
         outputs.append(output)
+        if tick < ground_ticks:
+            continue
         u = np.zeros(plant.n_u) if output.setpoint is None else plant.to_input(output.setpoint.accel_mps2)
         w = rng.multivariate_normal(np.zeros(plant.n_w), plant.w)
         x = plant.a @ x + plant.b @ u + plant.e @ w
@@ -79,6 +89,7 @@ def test_level_and_spread_follow_from_the_recorded_counts_alone(
         risk = None if output.link is None else output.link.risk
         if risk is not None:
             keeps_away = plans.get("flown", 0.0) > 0.0
+            assert risk.outside is not None
             ages = count_age(ages, risk.age, parameters.choice)
             loop = charge_risk(
                 loop,
@@ -116,15 +127,62 @@ def test_the_certificate_keeps_further_from_the_wall_in_silence_than_the_configu
     assert mean_distance_m("risk.budgets=certificate") > 1.2 * mean_distance_m("risk.budgets=configured")
 
 
-def test_by_default_and_in_recordings_of_before_the_budgets_are_the_configured_ones() -> None:
-    config = load_config("room")
+INDEPENDENT = (0.3, 0.3)  # the configured link
+
+
+def test_the_ages_before_the_flight_count() -> None:
+    config, ticks = load_room(), 900
+    controller = build_controller(config)
+    assert controller.risk is not None
+    inputs, outputs = fly(config, 3, ticks, INDEPENDENT)
+    risks = list_risks(outputs)
+    waited = [risk for risk in risks if risk.outside is None]
+    record = AgeRecord()
+    for risk in waited:
+        record = count_age(record, risk.age, controller.risk.choice)
+        assert (risk.level, risk.widening) == (record.level, 1.0)
+    assert record.level == len(controller.risk.choice.budgets) - 1
+    assert risks[len(waited)].level == record.level
+    assert run(build_controller(config), inputs) == outputs
+    # The first two seconds, and the first position, are not counted.
+    assert ticks - len(waited) == pytest.approx(2.0 / controller.plant.dt_s, abs=3)
+
+
+def test_without_the_ages_before_the_flight_it_begins_with_the_certificate() -> None:
+    _, outputs = fly(load_room("risk.from_first_position=false"), 3, 900, INDEPENDENT)
+    risks = list_risks(outputs)
+    assert len(risks) <= STEPS
+    assert risks[0].level == 0
+
+
+def test_a_source_that_is_off_before_the_flight_says_nothing_of_the_link() -> None:
+    config, off = load_room(), range(600, 800)
+    horizon = build_controller(config).horizon
+    _, outputs = fly(config, 3, 900, INDEPENDENT, off)
+    waited = [risk for risk in list_risks(outputs) if risk.outside is None]
+    assert max(risk.age for risk in waited) == horizon
+    assert not waited[-1].contradicts
+    assert waited[-1].level > 0
+
+
+def test_by_default_the_budgets_follow_the_link_and_in_recordings_of_before_they_do_not() -> None:
+    assert load_config("room").risk == load_room().risk
+    assert build_controller(load_config("room-hahn-stursberg")).risk is None
+    keys = ("adapt =", "budgets =", "from_first_position =")
+    text = "\n".join(line for line in dump_config(load_config("room")).splitlines() if not line.startswith(keys))
+    config = parse_recorded(text, "recording").config
     design = build_conditioned(config)
     assert build_controller(config, design).risk is None
     assert len(design.solver.levels) == 1
+
+
+def test_a_recording_of_before_that_followed_the_link_flies_as_it_did() -> None:
     text = "\n".join(
-        line for line in dump_config(load_room()).splitlines() if not line.startswith(("adapt =", "budgets ="))
+        line for line in dump_config(load_room()).splitlines() if not line.startswith("from_first_position =")
     )
-    assert parse_recorded(text, "recording").config.risk == config.risk
+    risk = build_controller(parse_recorded(text, "recording").config).risk
+    assert risk is not None
+    assert (risk.budgets, risk.from_first_position) == ("observed", False)
 
 
 def test_saturation_is_an_event_when_it_begins() -> None:

@@ -391,7 +391,7 @@ def _build_risk(config: Config, design: AnyDesign) -> RiskParameters | None:
     if not isinstance(design, ConditionedDesign) or risk.budgets == "configured":
         return None
     choice = make_level_choice(design.solver, 1.0 - config.smpc.delta_x)
-    return RiskParameters(choice, design.state_set.c, risk.budgets, risk.adapt)
+    return RiskParameters(choice, design.state_set.c, risk.budgets, risk.adapt, risk.from_first_position)
 
 
 def build_controller(config: Config, design: AnyDesign | None = None) -> Controller:

@@ -285,6 +285,8 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
         ("daemon", "parameters"): "false",
         ("daemon", "radio_channels"): "false",
         ("relay", "vehicle_time"): "false",
+        ("risk", "budgets"): '"configured"',
+        ("risk", "from_first_position"): "false",
         ("smpc", "scheme"): '"hahn-stursberg"',
     }
     missing = [

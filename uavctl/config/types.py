@@ -331,18 +331,24 @@ class RiskConfig(Section, frozen=True, kw_only=True):
     budgets: Annotated[
         Literal["certificate", "observed", "configured"],
         Meta(
-            description="risk of each age of information, with scheme `age-conditioned`: `configured` holds on a link "
-            "as in `[link]` alone; `certificate` holds on any link, further away from limits; `observed`, which is "
-            "new, begins as `certificate` and gives more to rare ages as far as the link in flight agrees with "
-            "`[link]`; measured in simulation only (docs/campaigns.md): on worse links it keeps the promise, at two "
-            "to four times the cost of a step"
+            description="risk of each age of information, with scheme `age-conditioned`: `observed` begins as "
+            "`certificate`, and gives more to rare ages as far as the link, from the first position on, agrees with "
+            "`[link]`; `certificate` holds on any link, further away from limits; `configured` holds on a link as in "
+            "`[link]` alone"
         ),
-    ] = "configured"
+    ] = "observed"
     adapt: Annotated[
         bool,
         Meta(
             description="keep further away from limits in flight while they are left more often than allowed, and "
             "nearer while less often, with `risk.budgets` `certificate` or `observed`"
+        ),
+    ] = True
+    from_first_position: Annotated[
+        bool,
+        Meta(
+            description="count the ages of positions from the first one on, also before the flight, and adapt slowly "
+            "where no limit is near; `false`, as in recordings of before: from the flight on, quickly everywhere"
         ),
     ] = True
 

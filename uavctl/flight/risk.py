@@ -1,7 +1,8 @@
 """Risk in flight: the record of the ages, and the loop on the risk of each step.
 
 1. At each Δt boundary on time, the age of the information that moved the vehicle there is counted: it was one step
-   younger when the step began.
+   younger when the step began. Ages before the flight count too, as it is the same link: from SETTLING_NS after the
+   first position on, and without silences that outlast the horizon, as of a source that is switched off.
 2. The risk of that state, given all that is known now, is charged while the controller flies.
 3. The next plan is made with the level and the spread that follow.
 """
@@ -18,7 +19,11 @@ from uavctl.flight.risk_state import RiskGroup, RiskParameters
 from uavctl.flight.supervise import Supervised
 from uavctl.records import Event, Plan, RiskRecord, Severity
 from uavctl.smpc.answer import CERTIFICATE_LEVEL, Preview
-from uavctl.smpc.conditioned.adaptation import charge_risk, compute_outside_risk, count_age
+from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
+
+# The first positions of a source do not show its clock yet: a few round trips take two seconds, and the smallest delay
+# shows itself within as much.
+SETTLING_NS = 2_000_000_000
 
 
 def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | None) -> Preview:
@@ -46,19 +51,41 @@ def update_risk(
     if parameters is None or not context.is_boundary or context.at_ns != context.boundary_ns or age_steps is None:
         return risk, None
     before = risk.age_steps
-    if before is None or not (context.was_in_control and context.is_controllable):
-        return RiskGroup(risk.ages, risk.loop, age_steps), None
+    is_flown = context.was_in_control and context.is_controllable
+    first_ns = context.at_ns if risk.first_ns is None else risk.first_ns
+    if before is None or not (is_flown or _is_counted_before_flight(first_ns, context, parameters)):
+        return RiskGroup(risk.ages, risk.loop, age_steps, first_ns, risk.renewed), None
+    if not is_flown and before >= context.controller.horizon:
+        return RiskGroup(risk.renewed, risk.loop, age_steps, first_ns, risk.renewed), None
     age = before + 1
     ages = count_age(risk.ages, age, parameters.choice)
+    renewed = ages if age_steps <= before else risk.renewed
+    if not is_flown:
+        return RiskGroup(ages, risk.loop, age_steps, first_ns, renewed), _make_record(age, None, ages, risk.loop)
     # Behind the horizon no plan keeps f times the deviation: with f there, a long silence would raise f without end.
     is_behind_horizon = age_steps >= context.controller.horizon
     widening = 1.0 if is_behind_horizon else risk.loop.widening
     outside = _find_outside_risk(widening, context, supervised, parameters, mission)
     keeps_away = plan is not None and plan.offset > 0.0
     loop = charge_risk(
-        risk.loop, outside, parameters.choice.allowed, keeps_away=keeps_away, is_behind_horizon=is_behind_horizon
+        risk.loop,
+        outside,
+        parameters.choice.allowed,
+        keeps_away=keeps_away,
+        is_behind_horizon=is_behind_horizon,
+        begins_anywhere=not parameters.from_first_position,
     )
-    record = RiskRecord(
+    return RiskGroup(ages, loop, age_steps, first_ns, renewed), _make_record(age, outside, ages, loop)
+
+
+def _is_counted_before_flight(first_ns: int, context: TickContext, parameters: RiskParameters) -> bool:
+    """Return whether a step counts in which the controller does not fly."""
+    return parameters.from_first_position and context.at_ns - first_ns >= SETTLING_NS
+
+
+def _make_record(age: int, outside: float | None, ages: AgeRecord, loop: LoopState) -> RiskRecord:
+    """Make the record of a step."""
+    return RiskRecord(
         age=age,
         level=ages.level,
         contradicts=ages.contradicts,
@@ -66,7 +93,6 @@ def update_risk(
         widening=loop.widening,
         silence_widening=loop.silence_widening,
     )
-    return RiskGroup(ages, loop, age_steps), record
 
 
 def report_saturation(before: RiskGroup, now: RiskGroup, context: TickContext) -> tuple[Event, ...]:

@@ -18,6 +18,8 @@ class RiskParameters:
     rows: Array  # state rows C (m, n_x)
     budgets: str  # `certificate`, or `observed`: the level follows the link
     adapts: bool  # whether the spread follows the risk as observed
+    # Whether the ages before the flight count, and the loop begins slowly far from limits; not in recordings of before
+    from_first_position: bool
 
 
 class RiskGroup(msgspec.Struct, frozen=True):
@@ -26,3 +28,5 @@ class RiskGroup(msgspec.Struct, frozen=True):
     ages: AgeRecord = AgeRecord()  # record of the ages
     loop: LoopState = LoopState()  # state of the loop
     age_steps: int | None = None  # age of the newest position at the last boundary; None before the first
+    first_ns: int | None = None  # first boundary with a position; None before
+    renewed: AgeRecord = AgeRecord()  # record of the ages up to the newest position, without the silence after it

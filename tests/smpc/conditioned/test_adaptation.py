@@ -155,6 +155,21 @@ def test_safe_steps_far_from_limits_lower_f_to_one_and_no_further() -> None:
     assert state.log_widening == 0.0
 
 
+def test_the_loop_begins_faster_beside_a_limit_only_and_everywhere_in_recordings_of_before() -> None:
+    full = (1.0 / ALLOWED) - adaptation.TARGET
+
+    def charge(*, keeps_away: bool, begins_anywhere: bool) -> float:
+        state = charge_risk(
+            LoopState(), 1.0, ALLOWED, keeps_away=keeps_away, is_behind_horizon=False, begins_anywhere=begins_anywhere
+        )
+        return state.log_widening
+
+    assert charge(keeps_away=False, begins_anywhere=False) == pytest.approx(adaptation.GAIN * full)
+    for keeps_away, begins_anywhere in ((True, False), (True, True), (False, True)):
+        first = charge(keeps_away=keeps_away, begins_anywhere=begins_anywhere)
+        assert first == pytest.approx(full / adaptation.FIRST_STEPS)
+
+
 def test_risk_in_a_silence_moves_the_end_of_plans_alone_and_is_forgotten_without_one() -> None:
     begin = LoopState()
     quiet = silent = begin

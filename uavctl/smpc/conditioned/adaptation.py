@@ -54,7 +54,9 @@ END_TOLERANCE = 0.08
 REVIEW_STEPS = 10  # steps between two choices of a level: one step changes a record little
 TARGET = 0.95  # share of α that the loop controls to: the rest is for the noise of f
 GAIN = 0.002  # γ: an error of f falls to half in some 100 steps; 0.004 costs 6 % at a wall on the configured link
-FIRST_STEPS = 60.0  # k_0: the gain is 1 / (k_0 + k) while that is larger than γ, so the loop begins faster
+# k_0: beside a limit the gain is 1 / (k_0 + k) while that is larger than γ, so the loop begins faster. Elsewhere a gust
+# of half a second at full speed would take f to its largest value, for the whole approach
+FIRST_STEPS = 60.0
 MIN_WIDENING = 0.75  # least f: a bound on what quiet steps alone may take from the back-offs
 # First g: the spread grows with the square root of time, so the end of a plan holds for a silence of 4 H steps. What is
 # learnt after the first silence comes too late on a link with long runs of losses
@@ -179,7 +181,13 @@ class LoopState(msgspec.Struct, frozen=True):
 
 
 def charge_risk(
-    state: LoopState, risk: float, allowed: float, *, keeps_away: bool, is_behind_horizon: bool
+    state: LoopState,
+    risk: float,
+    allowed: float,
+    *,
+    keeps_away: bool,
+    is_behind_horizon: bool,
+    begins_anywhere: bool = False,
 ) -> LoopState:
     """Charge the risk of a step.
 
@@ -187,9 +195,10 @@ def charge_risk(
         risk: Probability that the state of the step is outside, given all that is known in it.
         keeps_away: Whether the plan keeps away from a limit. Elsewhere nothing is saved for later.
         is_behind_horizon: Whether the information of the step is H steps old or older.
+        begins_anywhere: Whether the larger first gain counts far from limits too, as in recordings of before.
     """
-    # γ_k = max(γ, 1 / (k_0 + k))
-    gain = max(GAIN, 1.0 / (FIRST_STEPS + state.steps))
+    # γ_k = max(γ, 1 / (k_0 + k)) beside a limit, else γ
+    gain = max(GAIN, 1.0 / (FIRST_STEPS + state.steps)) if keeps_away or begins_anywhere else GAIN
     change = gain * (risk / allowed - TARGET)
     if change < 0.0 and not keeps_away:
         change = max(change, -max(state.log_widening, 0.0))

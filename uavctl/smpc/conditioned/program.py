@@ -196,7 +196,13 @@ class PartProgram:
             middle = 0.5 * (upper + lower)
             np.copyto(upper, middle, where=crossed)
             np.copyto(lower, middle, where=crossed)
-        return self._program.solve_sides(upper, lower, working_set, reuse_rows)
+        z = self._program.solve_sides(upper, lower, working_set, reuse_rows)
+        if z is None and not reuse_rows:
+            # DAQP cycles in rare programs. From other rows it takes another way: from those that z = 0 violates.
+            sense = self._program.sense
+            violated = np.where(upper < 0.0, sense + ACTIVE, np.where(lower > 0.0, sense + BELOW, sense))
+            z = self._program.solve_sides(upper, lower, violated.astype(np.int32))
+        return z
 
     def _guess_ramps(self, upper: Array, lower: Array) -> Sense | None:
         """Guess the active rows: the setpoint moves from the last one to the regulator's at the slew limit.
