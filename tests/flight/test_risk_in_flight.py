@@ -165,8 +165,8 @@ def test_a_source_that_is_off_before_the_flight_says_nothing_of_the_link() -> No
     assert waited[-1].level > 0
 
 
-def test_by_default_the_budgets_follow_the_link_and_in_recordings_of_before_they_do_not() -> None:
-    assert load_config("room").risk == load_room().risk
+def test_by_default_and_in_recordings_of_before_the_budgets_are_the_configured_ones() -> None:
+    assert build_controller(load_config("room")).risk is None
     assert build_controller(load_config("room-hahn-stursberg")).risk is None
     keys = ("adapt =", "budgets =", "from_first_position =")
     text = "\n".join(line for line in dump_config(load_config("room")).splitlines() if not line.startswith(keys))
