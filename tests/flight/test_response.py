@@ -303,6 +303,11 @@ def test_the_cause_says_where_the_speed_allowed_no_stop(north_m: float, north_mp
         assert says in text if says else not text
 
 
+def test_the_cause_says_where_nobody_knows_whether_it_could_stop() -> None:
+    tick = structs.replace(seen(START_NS, vehicle_motion=motion((0.0, 3.0, 4.0), START_NS)), position_m=None)
+    assert "5.0 m/s" in outside.describe_overrun(tick, PARAMETERS)
+
+
 def test_a_gap_in_inertial_data_begins_anew() -> None:
     last = START_NS, (1.0, *[0.0] * 9)
     state = ResponseState(
