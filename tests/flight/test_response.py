@@ -585,6 +585,9 @@ def test_positions_are_witness_beyond_a_bound(
     tick = structs.replace(FELT, motion=None)
     assert ends_plans(monkeypatch, 99.0, tick, observer, INITIAL) == is_witness
     assert not ends_plans(monkeypatch, 99.0, tick, structs.replace(observer, inertial=None), INITIAL)
+    for age_ns, counts in ((400 * MS, is_witness), (400 * MS + 1, False)):
+        old = structs.replace(observer, at_ns=START_NS - age_ns)
+        assert ends_plans(monkeypatch, 99.0, tick, old, INITIAL) == counts
 
 
 def test_sums_of_equal_samples_are_geometric_series() -> None:
