@@ -303,7 +303,7 @@ def test_the_cause_says_where_the_speed_allowed_no_stop(north_m: float, north_mp
         assert says in text if says else not text
 
 
-def test_the_cause_says_where_nobody_knows_whether_it_could_stop() -> None:
+def test_the_cause_says_where_the_position_is_not_known() -> None:
     tick = structs.replace(seen(START_NS, vehicle_motion=motion((0.0, 3.0, 4.0), START_NS)), position_m=None)
     assert "5.0 m/s" in outside.describe_overrun(tick, PARAMETERS)
 
@@ -533,20 +533,22 @@ def ends_plans(
 
 
 @pytest.mark.parametrize(
-    ("tick", "heard_ns", "observer", "change", "factor"),
+    ("tick", "heard_ns", "observer", "change", "factor", "is_heard"),
     [
-        (FELT, START_NS, NOISE_FREE, CONSISTENT, 1.0),
-        (FELT, START_NS - 400 * MS, NOISE_FREE, CONSISTENT, 1.0),
-        (FELT, START_NS - 400 * MS - 1, NOISE_FREE, CONSISTENT, 3.0),
-        (structs.replace(FELT, has_positions=True), None, None, CONSISTENT, 1.0),  # none is believed
-        (FELT, None, NOISE_FREE, CONSISTENT, 3.0),
-        (seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), START_NS, NOISE_FREE, INITIAL, 3.0),  # no inertial data
+        (FELT, START_NS, NOISE_FREE, CONSISTENT, 1.0, True),
+        (FELT, START_NS - 400 * MS, NOISE_FREE, CONSISTENT, 1.0, True),
+        (FELT, START_NS - 400 * MS - 1, NOISE_FREE, CONSISTENT, 3.0, False),
+        (structs.replace(FELT, has_positions=True), None, None, CONSISTENT, 1.0, True),  # none is believed
+        (FELT, None, NOISE_FREE, CONSISTENT, 3.0, False),
+        # no inertial data
+        (seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), START_NS, NOISE_FREE, INITIAL, 3.0, True),
         (
             structs.replace(FELT, motion=None),
             START_NS,
             structs.replace(NOISE_FREE, mean=np.array([ZERO, ZERO, (1.0, 0.0, 0.0)])),
             INITIAL,
             2.5,  # positions show it
+            True,
         ),
     ],
 )
@@ -557,15 +559,15 @@ def test_plans_end_beyond_a_bound_by_what_is_witness_and_how_near_a_wall_is(
     observer: Observer | None,
     change: VelocityChangeState,
     factor: float,
+    is_heard: bool,
     north_m: float,
     bound: float,
     braking: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tick = structs.replace(tick, position_m=(north_m, 0.0, -2.0), velocity_mps=(0.1, 0.0, 0.0), braking=braking)
-    is_silent = not tick.has_positions and (heard_ns is None or heard_ns < START_NS - 400 * MS)
     # While the fallback brakes, and positions come, the least evidence is enough.
-    limit = factor * (NEAR if braking and not is_silent else bound)
+    limit = factor * (1.4 if braking and is_heard else bound)
     assert not ends_plans(monkeypatch, limit, tick, observer, change, heard_ns)
     assert ends_plans(monkeypatch, just_more(limit), tick, observer, change, heard_ns)
 
@@ -656,11 +658,7 @@ def test_a_vehicle_that_can_just_stop_overruns_nothing() -> None:
         (0.0, 3.0 * (0.3 + 3.0 / 2.0 / 2.0)),
         (-4.5, 3.0 * (0.3 + math.hypot(3.0, 4.5) / (2.0 * 2.5))),
     ):
-        check_overrun(east_mps, stop_m)
-
-
-def check_overrun(east_mps: float, stop_m: float) -> None:
-    tick = structs.replace(seen(START_NS), position_m=(0.0, 0.0, -2.0), velocity_mps=(3.0, east_mps, 0.0))
-    for upper_m, overruns in ((stop_m, False), (just_less(stop_m), True)):
-        parameters = replace(PARAMETERS, lower_m=(-3.0, -999.0, -4.0), upper_m=(upper_m, 2.0, -1.0))
-        assert bool(outside.describe_overrun(tick, parameters)) == overruns
+        tick = structs.replace(seen(START_NS), position_m=(0.0, 0.0, -2.0), velocity_mps=(3.0, east_mps, 0.0))
+        for upper_m, overruns in ((stop_m, False), (just_less(stop_m), True)):
+            parameters = replace(PARAMETERS, lower_m=(-3.0, -999.0, -4.0), upper_m=(upper_m, 2.0, -1.0))
+            assert bool(outside.describe_overrun(tick, parameters)) == overruns

@@ -5,7 +5,7 @@
 3. One of both holds for 0.1 s. Then: end the plans.
 4. A vehicle that climbs by itself flies sideways. Then: break the climb off.
 
-False alarms (docs/soak.md): 0 of 200 missions.
+False alarms (docs/soak.md): 1 of 600 missions, where a burst of losses followed the take-off.
 """
 
 from __future__ import annotations
@@ -126,13 +126,13 @@ def list_approaches(
 def describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
     """Return in words the limits before which the vehicle cannot stop any more by its own landing; empty if none.
 
-    Without an estimated position the words say that nobody knows.
+    Without an estimated position the words say that this is not known.
     """
     text = ""
     velocity_mps = read_vehicle_velocity(tick.motion, tick.at_ns) or tick.velocity_mps
     speed_mps = math.hypot(*velocity_mps)
     if tick.position_m is None:
-        return f"; its position is not known, and so not either whether it could stop in time at {speed_mps:.1f} m/s"
+        return f"; its position is not known: at {speed_mps:.1f} m/s it may have been too fast to stop in time"
     for limit, distance_m, approach_mps, brake_mps2 in list_approaches(tick, parameters, velocity_mps):
         # All axes come to rest together: t = max(v_axis / a_axis, |v| / a); x < v_axis (T + t / 2)
         stop_s = max(approach_mps / brake_mps2, speed_mps / LANDING_MPS2)
