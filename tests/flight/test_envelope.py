@@ -45,34 +45,39 @@ def on_axis(axis: int, value: float, others: Vec3 = (0.0, 0.0, -2.0)) -> Vec3:
     return vec3(values)
 
 
-@pytest.mark.parametrize(("axis", "word"), [(0, "north"), (1, "east"), (2, "down")])
+@pytest.mark.parametrize(("axis", "words"), [(0, ("south", "north")), (1, ("west", "east")), (2, ("upper", "lower"))])
 @pytest.mark.fault(41)
-def test_an_estimate_beyond_a_limit_and_its_margin_is_outside_unless_it_comes_back(axis: int, word: str) -> None:
+def test_an_estimate_beyond_a_limit_and_its_margin_is_outside_unless_it_comes_back(
+    axis: int, words: tuple[str, str]
+) -> None:
     assert at(None) is None
     limits = ((PARAMETERS.lower_m[axis], -1.0), (PARAMETERS.upper_m[axis], 1.0))
-    for limit, outward in limits:
+    for word, (limit, outward) in zip(words, limits, strict=True):
         edge = limit + outward * PARAMETERS.outside_m[axis]
         assert at(on_axis(axis, edge)) is None
         breach = at(on_axis(axis, edge + outward * 1e-9))
-        assert breach is not None and f"limit of {word}" in breach.text and "beyond" in breach.text
+        assert breach is not None and f"beyond the {word} limit" in breach.text
         for speed, comes_back in ((1.0, True), (0.3, True), (just_less(0.3), False)):
             speeds = on_axis(axis, -outward * speed, ZERO)
             assert (at(on_axis(axis, edge + outward), speeds) is None) == comes_back
 
 
-@pytest.mark.parametrize(("axis", "word"), [(0, "north"), (1, "east"), (2, "down")])
+@pytest.mark.parametrize(("axis", "words"), [(0, ("south", "north")), (1, ("west", "east")), (2, ("upper", "lower"))])
 @pytest.mark.fault(41)
-def test_an_estimate_that_leaves_faster_than_it_can_brake_is_outside_before_it_is(axis: int, word: str) -> None:
+def test_an_estimate_that_leaves_faster_than_it_can_brake_is_outside_before_it_is(
+    axis: int, words: tuple[str, str]
+) -> None:
     """It flies on for 0.3 s, then brakes at the limit: v 0.3 + v² / 2b."""
     brake, margin = PARAMETERS.brake_mps2[axis], PARAMETERS.outside_m[axis]
-    for limit, outward in ((PARAMETERS.lower_m[axis], -1.0), (PARAMETERS.upper_m[axis], 1.0)):
+    limits = ((PARAMETERS.lower_m[axis], -1.0), (PARAMETERS.upper_m[axis], 1.0))
+    for word, (limit, outward) in zip(words, limits, strict=True):
         for room_m in (-0.4, 0.0, 0.7):  # to the limit; then the speed at which it comes to rest at the margin
             left = room_m + margin
             speed = -0.3 * brake + math.sqrt((0.3 * brake) ** 2 + 2.0 * brake * left)
             position = on_axis(axis, limit - outward * room_m)
             assert at(position, on_axis(axis, outward * (speed - 1e-9), ZERO)) is None
             breach = at(position, on_axis(axis, outward * (speed + 1e-9), ZERO))
-            assert breach is not None and f"limit of {word}" in breach.text and "brake" in breach.text
+            assert breach is not None and f"the {word} limit" in breach.text and "stop" in breach.text
         rests = on_axis(axis, limit + outward * margin)
         assert at(rests, ZERO) is None
         assert at(rests, on_axis(axis, outward * 1e-6, ZERO)) is not None
@@ -84,6 +89,27 @@ def test_an_estimate_that_comes_to_rest_at_the_margin_is_not_outside() -> None:
     for speed, outside in ((1.0, False), (1.0 + 1e-9, True)):
         ours = structs.replace(seen(AT_NS), position_m=(3.0, 0.0, -2.0), velocity_mps=(speed, 0.0, 0.0))
         assert is_outside(ours, parameters) == outside
+
+
+@pytest.mark.parametrize(("std_mps", "needs_both"), [(0.3, False), (just_more(0.3), True)])
+@pytest.mark.fault(41)
+def test_an_uncertain_velocity_is_outside_only_by_the_own_one_too(std_mps: float, *, needs_both: bool) -> None:
+    """After a silence the vehicle's own velocity decides, where it is known; a place beyond the margin needs none."""
+    observer = Observer(at_ns=AT_NS, mean=np.zeros((3, 3)), cov=np.diag([0.0, std_mps**2, 0.0]), accel_mps2=np.zeros(3))
+    leaves, beyond, rests, old = (2.5, 0.0, -2.0), (4.0, 0.0, -2.0), motion(ZERO, AT_NS), motion(ZERO, 0)
+    fast = motion((3.0, 0.0, 0.0), AT_NS)
+    for position, speed, own, is_found in (
+        (leaves, 3.0, None, True),
+        (leaves, 3.0, old, True),
+        (leaves, 3.0, fast, True),
+        (leaves, 3.0, rests, not needs_both),
+        (leaves, 0.0, fast, False),
+        (beyond, 0.0, rests, True),
+    ):
+        ours = seen(AT_NS, vehicle_motion=own)
+        ours = structs.replace(ours, position_m=position, velocity_mps=(speed, 0.0, 0.0))
+        known = monitors(observer=observer, outside_ns=AT_NS - 100 * MS)
+        assert (update(known, ours, PARAMETERS)[1] is not None) == is_found
 
 
 @pytest.mark.parametrize("speed", [-0.31, -0.3, -just_less(0.3), 9.0])

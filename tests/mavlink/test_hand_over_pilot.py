@@ -136,14 +136,14 @@ def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
 def test_a_climb_by_positions_that_cannot_be_is_broken_off(state: HandoverState) -> None:
     rig = HandoverRig("ardupilot").advance_to(state)
     assert rig.is_in(state)
-    rig.tick(climb_hazard="it is 0.7 m beyond the limit of down")
+    rig.tick(climb_hazard="it is 0.7 m beyond the lower limit")
     assert rig.is_in(HandoverState.LANDING) and rig.last_request(RequestKind.LAND)
     assert len(rig.codes("refused")) == 1
 
 
 def test_nothing_is_broken_off_while_nothing_climbs() -> None:
     rig = HandoverRig().advance_to(HandoverState.ENGAGED)
-    rig.tick(climb_hazard="it is 0.7 m beyond the limit of down")
+    rig.tick(climb_hazard="it is 0.7 m beyond the lower limit")
     assert rig.is_in(HandoverState.ENGAGED) and not rig.codes("refused")
 
 

@@ -13,18 +13,21 @@ from __future__ import annotations
 import math
 
 import msgspec
+from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
-from uavctl.flight.limits import AXES
-from uavctl.flight.monitors.motion import TickObservation
+from uavctl.flight.monitors.motion import Motion, TickObservation
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, read_vehicle_velocity
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vec3
 
 LASTS_NS = 100_000_000  # one estimate alone may be a late sample's fault
 RETURNS_MPS = 0.3  # a vehicle outside that moves so fast towards the limit is on its way back
+STANDS_MPS = 0.05  # an outward speed that is shown as 0.0 m/s
 SIDEWAYS_MPS = 0.6  # upright climbs in gusts of 5 m/s came to 0.25 m/s
 REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
+# Standard deviation of the velocity by positions: 0.15 m/s at 5 Hz, 0.33 m/s at the first one after a silence of 1 s
+UNCERTAIN_MPS = 0.3
 LANDING_MPS2 = 2.5  # deceleration of a vehicle that brakes by itself, as recorded of ArduCopter
 
 _LIMITS = (("south", "north"), ("west", "east"), ("upper", "lower"))
@@ -38,12 +41,22 @@ class OutsideState(msgspec.Struct, frozen=True):
 
 def update(state: OutsideState, observation: TickObservation) -> tuple[OutsideState, Verdict]:
     """Take a tick."""
-    text = _describe_outside(observation.tick, observation.parameters)
+    tick, parameters = observation.tick, observation.parameters
+    text = _describe_outside(tick, parameters)
+    vehicle_mps = read_vehicle_velocity(tick.motion, tick.at_ns)
+    if text is not None and vehicle_mps is not None and _is_velocity_uncertain(observation.motion):
+        # One position does not tell an early gust from a late one: the estimated velocity may be twice the true one.
+        text = _describe_outside(replace(tick, velocity_mps=vehicle_mps), parameters)
     if text is None:
         return OutsideState(), NO_VERDICT
-    since_ns = state.since_ns or observation.tick.at_ns
-    lasts = observation.tick.at_ns - since_ns >= LASTS_NS
+    since_ns = state.since_ns or tick.at_ns
+    lasts = tick.at_ns - since_ns >= LASTS_NS
     return OutsideState(since_ns), end_plans(EventCode.OUTSIDE, text) if lasts else NO_VERDICT
+
+
+def _is_velocity_uncertain(motion: Motion) -> bool:
+    """Whether too few positions have come since the last silence for them to show the velocity."""
+    return motion.observer is not None and float(motion.observer.cov[1, 1]) > UNCERTAIN_MPS * UNCERTAIN_MPS
 
 
 def describe_sideways(observation: Observation) -> str:
@@ -76,7 +89,7 @@ def _describe_outside(observation: Observation, parameters: EnvelopeParameters, 
     if observation.position_m is None:
         return None
     rows = zip(
-        AXES,
+        _LIMITS,
         parameters.axes,
         observation.position_m,
         observation.velocity_mps,
@@ -86,16 +99,15 @@ def _describe_outside(observation: Observation, parameters: EnvelopeParameters, 
         parameters.brake_mps2,
         strict=True,
     )
-    for axis, has, position, velocity, lower, upper, margin, brake in rows:
+    for (below, above), has, position, velocity, lower, upper, margin, brake in rows:
         if has and not math.isfinite(position + velocity):
-            return f"the estimate of {axis} is no number"
-        for out_m, outward in ((lower - position, -velocity), (position - upper, velocity)):
-            if out_m > margin and outward > -RETURNS_MPS:
-                return f"the estimate is {out_m:.1f} m beyond the limit of {axis}"
+            return f"the estimate of the way to the {above} limit is no number"
+        for limit, out_m, outward in ((below, lower - position, -velocity), (above, position - upper, velocity)):
             # s = v T + v² / 2 a
             stop_m = outward * REACTION_S + outward * outward / (2.0 * brake)
-            if brakes and outward > 0.0 and out_m + stop_m > margin:
-                return f"the estimate leaves the limit of {axis} at {outward:.1f} m/s, faster than it can brake"
+            is_beyond = out_m > margin and outward > -RETURNS_MPS
+            if is_beyond or (brakes and outward > 0.0 and out_m + stop_m > margin):
+                return f"the estimate is {_describe_approach(out_m, limit, outward)}"
     return None
 
 
@@ -137,6 +149,11 @@ def describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
         # All axes come to rest together: t = max(v_axis / a_axis, |v| / a); x < v_axis (T + t / 2)
         stop_s = max(approach_mps / brake_mps2, speed_mps / LANDING_MPS2)
         if distance_m < approach_mps * (REACTION_S + stop_s / 2.0):
-            place = f"{distance_m:.1f} m before" if distance_m > 0.0 else f"{-distance_m:.1f} m beyond"
-            text += f"; {place} the {limit} limit at {approach_mps:.1f} m/s, it could not stop in time"
+            text += f"; {_describe_approach(-distance_m, limit, approach_mps)}"
     return text
+
+
+def _describe_approach(out_m: float, limit: str, outward_mps: float) -> str:
+    """Return how far beyond a limit the vehicle is, and that it could not stop where it flies outward."""
+    place = f"{out_m:.1f} m beyond the {limit} limit" if out_m > 0.0 else f"{-out_m:.1f} m before the {limit} limit"
+    return f"{place} at {outward_mps:.1f} m/s, it could not stop in time" if outward_mps > STANDS_MPS else place
