@@ -184,6 +184,16 @@ def test_nothing_is_compared_while_positions_correct_the_velocity() -> None:
     assert all(state.samples == () for state in states[:count]) and len(states[count].samples) == 1
 
 
+@pytest.mark.parametrize("are_compared", [True, False])
+def test_a_disagreement_is_decided_when_positions_come_back(*, are_compared: bool) -> None:
+    """Without it, an own velocity that lies since the last message would be believed against what comes back."""
+    samples = ((START_NS - TICK_NS, ZERO, ZERO, ZERO), (START_NS, north(1.0), north(0.1), ZERO))
+    state = VelocityChangeState(samples=samples if are_compared else (), disagrees_ns=START_NS)
+    (after,) = fly(1, true, true, state=state, motion_state=Motion(resumed_ns=START_NS))
+    assert is_found(after) == (are_compared, False)
+    assert after.samples == () and after.disagrees_ns is None
+
+
 def test_inertial_data_are_compared_again_after_three_seconds() -> None:
     wrong = VelocityChangeState(inertial_wrong_ns=START_NS)
     states = fly(80, true, true, state=wrong)

@@ -83,6 +83,11 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     own = read_vehicle_velocity(tick.motion, tick.at_ns)
     own_ns = None if tick.motion is None else tick.motion.velocity_ns
     is_corrected = motion.resumed_ns is not None and tick.at_ns < motion.resumed_ns + CORRECTS_NS
+    unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
+    if is_corrected and state.disagrees_ns is not None and state.samples:
+        # What was found before positions came back counts: both changes are not compared while they correct one.
+        last_ns = state.disagrees_ns + PERSISTS_NS
+        state = _compare(state, state.samples[0], state.samples[-1], unexplained, last_ns, parameters)
     if own is None or own_ns is None or is_corrected:
         return replace(state, samples=(), disagrees_ns=None, repeated=None)
     state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
@@ -96,7 +101,6 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     kept = state.samples[bisect_left(state.samples, own_ns - WINDOW_NS, key=_TIME) :]
     sample = (own_ns, own, gained, motion.model_mps)
     state = replace(state, samples=(*kept, sample))
-    unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
     return _compare(state, kept[0] if kept else sample, sample, unexplained, tick.at_ns, parameters)
 
 
