@@ -39,10 +39,11 @@ def measure_noise(offsets_m: np.ndarray, *, step_ns: int = STEP_NS, accel_mps2: 
     return track
 
 
+@pytest.mark.parametrize("step_ns", [STEP_NS, 4 * STEP_NS])
 @pytest.mark.parametrize("std_m", [0.02, 0.05])
-def test_noise_is_measured(std_m: float) -> None:
+def test_noise_is_measured(std_m: float, step_ns: int) -> None:
     rng = np.random.default_rng(1)
-    sizes = [measure_noise(std_m * rng.standard_normal((30, 3))).std_m for _ in range(50)]
+    sizes = [measure_noise(std_m * rng.standard_normal((30, 3)), step_ns=step_ns).std_m for _ in range(50)]
     assert np.median(sizes) == pytest.approx(std_m, rel=0.15)
 
 
@@ -73,8 +74,30 @@ def test_noise_is_bounded_and_needs_positions_close_to_one_another() -> None:
     rng = np.random.default_rng(3)
     wild = rng.standard_normal((30, 3))
     assert measure_noise(wild).std_m == 0.1
-    far = measure_noise(wild, step_ns=4 * STEP_NS)
+    far = measure_noise(wild, step_ns=5 * STEP_NS)
     assert not far.is_known and far.std_m == 0.0
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "counts"), [((0, 200, 400, 600), True), ((0, 400, 600, 800), True), ((0, 400, 600, 810), False)]
+)
+def test_far_from_its_neighbours_a_position_is_compared_with_a_parabola(
+    times_ms: tuple[int, ...], *, counts: bool
+) -> None:
+    """The three others and one coefficient each: r = |p - Σ c_i p_i| / √(1 + Σ c_i²); a parabola leaves nothing."""
+    times_s, off_m = 1e-3 * np.array(times_ms), 0.12
+    paths = np.polynomial.polynomial.polyvander(times_s, 2) @ np.array(
+        [[1.0, 2.0, 3.0], [0.5, -1.0, 0.0], [2.0, -3.0, 1.0]]
+    )
+    others = [0, 1, 3]
+    coefficients = np.linalg.solve(np.vander(times_s[others], 3).T, np.vander(times_s[[2]], 3)[0])
+    for moved_m in (0.0, off_m):
+        track = NoiseTrack()
+        for k, ms in enumerate(times_ms):
+            north, east, down = (paths[k] + (moved_m * np.eye(3)[2] if k == 2 else 0.0)).tolist()
+            track = noise.update(track, make_sample(1 + ms * 1_000_000, (north, east, down)), 1 + ms * 1_000_000)
+        expected = (moved_m / math.sqrt(1.0 + float(coefficients @ coefficients)),)
+        assert track.residuals_m[-1:] == pytest.approx(expected if counts else (), abs=1e-9)
 
 
 @pytest.mark.parametrize(
