@@ -22,6 +22,7 @@ import msgspec
 from uavctl.records import PositionSample, Vec3
 
 USUAL_STD_M = 0.012  # largest noise that the bounds of other monitors include
+UNKNOWN_STD_M = 0.05  # noise that monitors of the motion reckon with before it is known: that of a poor camera system
 LARGEST_STD_M = 0.1  # a camera system that works has no larger noise
 # Part by which the noise that n residuals show counts for more: FEW (1/n - 1/15). One residual may be four times too
 # small, and the median of three two times.
