@@ -23,6 +23,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "uavctl/flight/fallback.py": ("tests/flight/test_fallback.py",),
     "uavctl/flight/limits.py": ("tests/flight/test_limits.py",),
     "uavctl/flight/monitors/acceleration.py": ENVELOPE,
+    "uavctl/flight/monitors/approach.py": ("tests/flight/test_approach.py",),
     "uavctl/flight/monitors/braking.py": ENVELOPE,
     "uavctl/flight/monitors/engaged.py": ENVELOPE,
     "uavctl/flight/monitors/external.py": ("tests/flight/test_external_monitor.py",),

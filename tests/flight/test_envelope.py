@@ -120,6 +120,12 @@ def test_being_beyond_a_limit_is_without_what_braking_needs(beyond_m: float, spe
     assert bool(describe_beyond(ours, PARAMETERS)) == (beyond_m > 0.0 and speed > -0.3)
 
 
+@pytest.mark.parametrize(("speed", "says"), [(0.05, False), (just_more(0.05), True)])
+def test_the_cause_says_that_it_could_not_stop_unless_it_stands(speed: float, *, says: bool) -> None:
+    ours = structs.replace(seen(AT_NS), position_m=(9.0, 0.0, -2.0), velocity_mps=(speed, 0.0, 0.0))
+    assert ("stop" in describe_beyond(ours, PARAMETERS)) == says
+
+
 @pytest.mark.fault(99)
 @pytest.mark.parametrize("by_itself", [True, False])
 def test_a_climb_that_is_not_upright_is_found_by_either_velocity(by_itself: bool) -> None:

@@ -79,7 +79,7 @@ def test_noise_is_bounded_and_needs_positions_close_to_one_another() -> None:
 
 
 @pytest.mark.parametrize(
-    ("times_ms", "counts"), [((0, 200, 400, 600), True), ((0, 400, 600, 800), True), ((0, 400, 600, 810), False)]
+    ("times_ms", "counts"), [((0, 200, 400, 600), True), ((0, 250, 500, 700), True), ((0, 250, 500, 701), False)]
 )
 def test_far_from_its_neighbours_a_position_is_compared_with_a_parabola(
     times_ms: tuple[int, ...], *, counts: bool
@@ -98,6 +98,7 @@ def test_far_from_its_neighbours_a_position_is_compared_with_a_parabola(
             track = noise.update(track, make_sample(1 + ms * 1_000_000, (north, east, down)), 1 + ms * 1_000_000)
         expected = (moved_m / math.sqrt(1.0 + float(coefficients @ coefficients)),)
         assert track.residuals_m[-1:] == pytest.approx(expected if counts else (), abs=1e-9)
+        assert [at_ns for at_ns, _ in track.last] == [1 + ms * 1_000_000 for ms in times_ms[1:]]
 
 
 @pytest.mark.parametrize(

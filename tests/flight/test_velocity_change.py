@@ -187,7 +187,11 @@ def test_nothing_is_compared_while_positions_correct_the_velocity() -> None:
 @pytest.mark.parametrize("are_compared", [True, False])
 def test_a_disagreement_is_decided_when_positions_come_back(*, are_compared: bool) -> None:
     """Without it, an own velocity that lies since the last message would be believed against what comes back."""
-    samples = ((START_NS - TICK_NS, ZERO, ZERO, ZERO), (START_NS, north(1.0), north(0.1), ZERO))
+    samples = (
+        (START_NS - 2 * TICK_NS, ZERO, ZERO, ZERO),
+        (START_NS - TICK_NS, ZERO, north(9.0), ZERO),
+        (START_NS, north(1.0), north(0.1), ZERO),
+    )
     state = VelocityChangeState(samples=samples if are_compared else (), disagrees_ns=START_NS)
     (after,) = fly(1, true, true, state=state, motion_state=Motion(resumed_ns=START_NS))
     assert is_found(after) == (are_compared, False)

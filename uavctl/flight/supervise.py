@@ -56,7 +56,6 @@ from uavctl.flight.monitors import engaged, external, inertial, outside, vehicle
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.external import AnswerObservation, ExternalState, WallObservation
 from uavctl.flight.monitors.inertial import ComparedSource, InertialObservation
-from uavctl.flight.monitors.noise import UNKNOWN_STD_M
 from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
@@ -65,6 +64,8 @@ from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
 from uavctl.records import ControlMode, Estimate, Order, PositionSample
 
+# Noise that monitors of the motion reckon with before it is known: that of a poor camera system
+UNKNOWN_STD_M = 0.05
 # Causes after which no position is believed any more.
 POSITION_CODES = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
 ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING, EventCode.SETPOINT_RESPONSE})

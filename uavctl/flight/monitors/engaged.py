@@ -2,7 +2,8 @@
 
 1. The shared record of motion takes the tick (`uavctl.flight.monitors.motion`).
 2. Each believed position goes through the monitors of acceleration and velocity.
-3. Then the monitors of the tick are asked: an open contradiction, outside the room, braking.
+3. Then the monitors of the tick are asked: an open contradiction, outside the room, braking, an
+   approach to a limit.
 4. The first verdict counts. A position at which no monitor finds anything is clean. When plans end, later positions are
    dropped.
 """
@@ -14,8 +15,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
-from uavctl.flight.monitors import acceleration, braking, outside, response, velocity, velocity_change
+from uavctl.flight.monitors import acceleration, approach, braking, outside, response, velocity, velocity_change
 from uavctl.flight.monitors.acceleration import AccelerationState
+from uavctl.flight.monitors.approach import ApproachState
 from uavctl.flight.monitors.braking import BrakingState
 from uavctl.flight.monitors.motion import Motion, TickObservation, take_position, update_motion
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, select_axes
@@ -41,6 +43,7 @@ class MonitorState(msgspec.Struct, frozen=True, eq=False):
     braking: BrakingState = BrakingState()
     velocity_change: VelocityChangeState = VelocityChangeState()
     response: ResponseState = ResponseState()
+    approach: ApproachState = ApproachState()
     consistent_ns: int | None = None  # capture time of the last clean position [ns]; None before any
     agreed: bool = False  # whether positions agreed with the vehicle's inertial data before the flight
 
@@ -75,6 +78,7 @@ def update(
     believes_velocity = change_state.velocity_wrong_ns is None
     braking_state, no_effect = braking.update(state.braking, tick, believes_velocity=believes_velocity)
     response_state, wrong_response = response.update(state.response, tick, change_state)
+    approach_state, no_answer = approach.update(state.approach, tick, change_state, response_state)
     state = replace(
         state,
         velocity=velocity_state,
@@ -82,8 +86,9 @@ def update(
         braking=braking_state,
         velocity_change=change_state,
         response=response_state,
+        approach=approach_state,
     )
-    return state, _select_first(first, wrong_response, unresolved, is_out, no_effect)
+    return state, _select_first(first, wrong_response, unresolved, is_out, no_effect, no_answer)
 
 
 def _update_with_position(

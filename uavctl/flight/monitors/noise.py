@@ -22,7 +22,6 @@ import msgspec
 from uavctl.records import PositionSample, Vec3
 
 USUAL_STD_M = 0.012  # largest noise that the bounds of other monitors include
-UNKNOWN_STD_M = 0.05  # noise that monitors of the motion reckon with before it is known: that of a poor camera system
 LARGEST_STD_M = 0.1  # a camera system that works has no larger noise
 # Part by which the noise that n residuals show counts for more: FEW (1/n - 1/15). One residual may be four times too
 # small, and the median of three two times.
@@ -65,16 +64,12 @@ def _find_residual_m(last: Sequence[tuple[int, Vec3]]) -> float | None:
     """Find how far the last position but one is off its neighbours [m]; None where they are too far apart."""
     if len(last) < 3:
         return None
-    middle_ns, middle_m = last[-2]
-    others = [*last[-3:-2], last[-1]]
+    (middle_ns, middle_m), others = last[-2], [*last[:-2], last[-1]]
     times_s = [(at_ns - middle_ns) * 1e-9 for at_ns, _ in others]
-    if abs(math.prod(times_s)) > _LARGEST_S2:
-        if len(last) < 4:
-            return None
-        others = [*last[-4:-2], last[-1]]
-        times_s = [(at_ns - middle_ns) * 1e-9 for at_ns, _ in others]
-        if math.prod(times_s) > _LARGEST_S3:
-            return None
+    if abs(math.prod(times_s[-2:])) <= _LARGEST_S2:
+        others, times_s = others[-2:], times_s[-2:]
+    elif len(others) < 3 or math.prod(times_s) > _LARGEST_S3:
+        return None
     # r = p - Σ c_i p_i with c_i = Π_j t_j / (t_j - t_i), whose variance is (1 + Σ c_i²) σ²
     parts = [math.prod(t / (t - own) for t in times_s if t != own) for own in times_s]
     columns = zip(middle_m, *(place for _, place in others), strict=True)

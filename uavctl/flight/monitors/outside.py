@@ -111,14 +111,23 @@ def _describe_outside(observation: Observation, parameters: EnvelopeParameters, 
     return None
 
 
-def list_approaches(
-    tick: Observation, parameters: EnvelopeParameters, velocity_mps: Vec3
-) -> list[tuple[str, float, float, float]]:
-    """List the limits that the vehicle flies to: name, distance [m], speed [m/s], and deceleration [m/s²]."""
+class Approach(msgspec.Struct, frozen=True):
+    """A limit that the vehicle flies to."""
+
+    axis: int
+    limit: str
+    distance_m: float  # negative beyond it
+    speed_mps: float
+    brake_mps2: float  # largest deceleration
+
+
+def list_approaches(tick: Observation, parameters: EnvelopeParameters, velocity_mps: Vec3) -> list[Approach]:
+    """List the limits that the vehicle flies to."""
     if tick.position_m is None:
         return []
     approaches = []
     rows = zip(
+        range(len(_LIMITS)),
         _LIMITS,
         tick.position_m,
         velocity_mps,
@@ -127,11 +136,11 @@ def list_approaches(
         parameters.brake_mps2,
         strict=True,
     )
-    for (below, above), position, velocity, lower, upper, brake in rows:
+    for axis, (below, above), position, velocity, lower, upper, brake in rows:
         if velocity > 0.0:
-            approaches.append((above, upper - position, velocity, brake))
+            approaches.append(Approach(axis, above, upper - position, velocity, brake))
         elif velocity < 0.0:
-            approaches.append((below, position - lower, -velocity, brake))
+            approaches.append(Approach(axis, below, position - lower, -velocity, brake))
     return approaches
 
 
@@ -145,11 +154,11 @@ def describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
     speed_mps = math.hypot(*velocity_mps)
     if tick.position_m is None:
         return f"; its position is not known: at {speed_mps:.1f} m/s it may have been too fast to stop in time"
-    for limit, distance_m, approach_mps, brake_mps2 in list_approaches(tick, parameters, velocity_mps):
+    for approach in list_approaches(tick, parameters, velocity_mps):
         # All axes come to rest together: t = max(v_axis / a_axis, |v| / a); x < v_axis (T + t / 2)
-        stop_s = max(approach_mps / brake_mps2, speed_mps / LANDING_MPS2)
-        if distance_m < approach_mps * (REACTION_S + stop_s / 2.0):
-            text += f"; {_describe_approach(-distance_m, limit, approach_mps)}"
+        stop_s = max(approach.speed_mps / approach.brake_mps2, speed_mps / LANDING_MPS2)
+        if approach.distance_m < approach.speed_mps * (REACTION_S + stop_s / 2.0):
+            text += f"; {_describe_approach(-approach.distance_m, approach.limit, approach.speed_mps)}"
     return text
 
 

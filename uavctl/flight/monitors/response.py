@@ -322,7 +322,8 @@ def _remove_drag(left: float, with_velocity: float, speed: float) -> float:
 def _compute_bound(tick: Observation, parameters: EnvelopeParameters) -> float:
     """Compute the bound of the evidence, by the time that is left to brake before a wall."""
     left_s = FAR_S
-    for _, distance_m, speed_mps, brake_mps2 in list_approaches(tick, parameters, tick.velocity_mps):
+    for approach in list_approaches(tick, parameters, tick.velocity_mps):
+        speed_mps = approach.speed_mps
         # t = (x - v T - v² / 2 a) / v
-        left_s = min(left_s, distance_m / speed_mps - REACTION_S - speed_mps / (2.0 * brake_mps2))
+        left_s = min(left_s, approach.distance_m / speed_mps - REACTION_S - speed_mps / (2.0 * approach.brake_mps2))
     return NEAR + (FAR - NEAR) * max(left_s, 0.0) / FAR_S

@@ -1,0 +1,119 @@
+"""The monitor of approaches: setpoints that do not slow the vehicle down before a limit."""
+
+from __future__ import annotations
+
+import pytest
+from envelope_rig import PARAMETERS, just_less, just_more, seen
+from flight_rig import MS, START_NS
+from msgspec import structs
+
+from uavctl.event_codes import EventCode
+from uavctl.flight.monitors import approach
+from uavctl.flight.monitors.approach import ApproachState
+from uavctl.flight.monitors.motion import Motion, TickObservation
+from uavctl.flight.monitors.response import ResponseState
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
+from uavctl.flight.monitors.verdict import Action
+from uavctl.records import Vec3
+
+SPEED_MPS = 0.5
+LIMITS = [(axis, side) for axis in range(3) for side in (-1.0, 1.0)]
+
+
+def along(axis: int, value: float) -> Vec3:
+    values = [0.0, 0.0, 0.0]
+    values[axis] = value
+    return values[0], values[1], values[2]
+
+
+def is_found(
+    axis: int = 0,
+    side: float = 1.0,
+    *,
+    asked_mps2: float = 1.0,
+    got_mps2: float = 0.0,
+    speed_mps: float = SPEED_MPS,
+    left_m: float = 0.5,
+    push_mps2: float = 0.0,
+    span_ns: int = 1000 * MS,
+    since_ns: int = 100 * MS,
+    velocity_wrong_ns: int | None = None,
+    has_position: bool = True,
+) -> bool:
+    """Whether the plans end for a vehicle that flies to a limit, asked for a deceleration of which some comes."""
+    s = 1e-9 * span_ns
+    limit = (PARAMETERS.lower_m if side < 0.0 else PARAMETERS.upper_m)[axis]
+    middle = [(lower + upper) / 2.0 for lower, upper in zip(PARAMETERS.lower_m, PARAMETERS.upper_m, strict=True)]
+    middle[axis] = limit - side * left_m
+    place: Vec3 = (middle[0], middle[1], middle[2])
+    at_ns = START_NS + span_ns
+    change = VelocityChangeState(
+        samples=(
+            (START_NS, along(axis, side * (speed_mps + got_mps2 * s)), None, along(axis, 3.0)),
+            (START_NS + 1, along(axis, 9.0), None, along(axis, -9.0)),
+            (at_ns, along(axis, side * speed_mps), None, along(axis, 3.0 - side * (asked_mps2 + push_mps2) * s)),
+        ),
+        velocity_wrong_ns=velocity_wrong_ns,
+    )
+    response = ResponseState(baseline=(2.0, *along(axis, 2.0 * side * push_mps2), 0.0, 0.0, 0.0))
+    tick = structs.replace(seen(at_ns), position_m=place if has_position else None)
+    observation = TickObservation(tick, Motion(), PARAMETERS)
+    state, verdict = approach.update(ApproachState(at_ns - since_ns), observation, change, response)
+    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.END_PLANS, EventCode.SETPOINT_RESPONSE)
+    assert verdict.is_none or state.since_ns == at_ns - since_ns
+    return not verdict.is_none
+
+
+@pytest.mark.parametrize(("axis", "side"), LIMITS)
+def test_a_deceleration_that_does_not_come_before_a_limit_ends_the_plans(axis: int, side: float) -> None:
+    assert is_found(axis, side)
+    assert is_found(axis, side, left_m=-0.3)
+    assert not is_found(axis, side, got_mps2=0.3)
+    assert not is_found(axis, side, asked_mps2=-1.0)  # it is asked to fly there
+
+
+@pytest.mark.parametrize(("axis", "side"), LIMITS)
+def test_a_steady_wind_is_no_deceleration(axis: int, side: float) -> None:
+    """Against a wind of 1 m/s² that has blown before, a setpoint of 1 m/s² asks for nothing."""
+    assert not is_found(axis, side, asked_mps2=0.0, push_mps2=1.0)
+    assert is_found(axis, side, asked_mps2=1.0, push_mps2=1.0)
+
+
+@pytest.mark.parametrize(
+    ("inside", "beyond"),
+    [
+        ({"left_m": 1.0}, {"left_m": just_more(1.0)}),
+        ({"speed_mps": 0.1, "left_m": 0.1}, {"speed_mps": just_less(0.1), "left_m": 0.1}),
+        ({"asked_mps2": 0.5}, {"asked_mps2": 0.5 - 1e-9}),
+        ({"got_mps2": 0.25 - 1e-9}, {"got_mps2": 0.25}),
+        ({"got_mps2": 0.5 - 1e-9, "asked_mps2": 2.0}, {"got_mps2": 0.5 + 1e-9, "asked_mps2": 2.0}),
+        ({"got_mps2": 0.25 - 1e-9, "span_ns": 800 * MS}, {"got_mps2": 0.25 + 1e-9, "span_ns": 800 * MS}),
+        ({"span_ns": 700 * MS}, {"span_ns": 700 * MS - 1}),
+        ({"since_ns": 100 * MS}, {"since_ns": 100 * MS - 1}),
+    ],
+)
+def test_each_bound_counts(inside: dict[str, float], beyond: dict[str, float]) -> None:
+    assert is_found(**inside) and not is_found(**beyond)  # type: ignore[arg-type]
+
+
+def test_nothing_is_found_without_a_position_or_with_a_velocity_that_is_wrong() -> None:
+    assert not is_found(has_position=False)
+    assert not is_found(velocity_wrong_ns=START_NS)
+    tick = structs.replace(seen(START_NS), position_m=(2.9, 0.0, -2.0))
+    observation = TickObservation(tick, Motion(), PARAMETERS)
+    for change in (
+        VelocityChangeState(),
+        VelocityChangeState(samples=((START_NS, along(0, 1.0), None, along(0, 0.0)),)),
+    ):
+        state, verdict = approach.update(ApproachState(START_NS), observation, change, ResponseState())
+        assert verdict.is_none and state == ApproachState()
+
+
+def test_where_little_is_unexplained_so_far_it_counts_too() -> None:
+    tick = structs.replace(seen(START_NS + 1000 * MS), position_m=(2.9, 0.0, -2.0))
+    first, last = ((at, along(0, 0.5), None, along(0, speed)) for at, speed in ((START_NS, 1.0), (tick.at_ns, 0.0)))
+    for count, is_known in ((0.0, False), (0.5, True)):
+        observation, change = TickObservation(tick, Motion(), PARAMETERS), VelocityChangeState(samples=(first, last))
+        response = ResponseState(baseline=(count, *6 * (0.0,)))
+        verdict = approach.update(ApproachState(START_NS), observation, change, response)[1]
+        assert verdict.is_none != is_known

@@ -1,0 +1,82 @@
+"""Monitor: do setpoints slow the vehicle down where it flies to a limit?
+
+1. Over the last second the changes of the own velocity and of the velocity that setpoints give are known
+   (`uavctl.flight.monitors.velocity_change`). A steady wind is taken off: the mean of what setpoints left unexplained.
+2. The vehicle is within two seconds of a limit, or beyond it. Setpoints ask for a deceleration of 0.5 m/s² or more, and
+   less than a quarter of it comes, for 0.1 s. Then: end the plans. The vehicle's own landing brakes without setpoints.
+
+A response that is dead and a wind that sets in look alike where setpoints change little: the monitor of the response
+cannot tell them. Before a limit it does not matter which of both it is.
+
+False alarms: 0 of 290 healthy flights in gusts of 3 and 8 m/s, with noise of 5 cm, blackouts and take-offs. In none did
+less than 0.3 of such a deceleration come.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from uavctl.event_codes import EventCode
+from uavctl.flight.monitors.motion import TickObservation
+from uavctl.flight.monitors.outside import describe_overrun, list_approaches
+from uavctl.flight.monitors.response import ResponseState
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
+from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
+
+SPAN_NS = 700_000_000  # least time between two velocities that are compared: the lag of a vehicle is a quarter of it
+LEFT_S = 2.0  # time to the limit at the present speed: a vehicle at 1.5 m/s needs 1.2 s of it for its own landing
+LEAST_MPS = 0.1  # least speed: hovering in gusts makes less
+ASKED_MPS2, PART = 0.5, 0.25  # deceleration that is asked for, and the part of it that comes from a right response
+PERSISTS_NS = 100_000_000
+
+
+class ApproachState(msgspec.Struct, frozen=True):
+    """State of the monitor."""
+
+    since_ns: int | None = None  # since when setpoints have not slowed the vehicle down [ns]; None while they do
+
+
+def update(
+    state: ApproachState, observation: TickObservation, change: VelocityChangeState, response: ResponseState
+) -> tuple[ApproachState, Verdict]:
+    """Take a tick.
+
+    Args:
+        change: State of the monitor that keeps the changes of both velocities, after this tick.
+        response: State of the monitor that keeps what setpoints leave unexplained, after this tick.
+    """
+    tick, parameters = observation.tick, observation.parameters
+    text = _describe_approach(observation, change, response)
+    if not text:
+        return ApproachState(), NO_VERDICT
+    since_ns = tick.at_ns if state.since_ns is None else state.since_ns
+    if tick.at_ns - since_ns < PERSISTS_NS:
+        return ApproachState(since_ns), NO_VERDICT
+    return ApproachState(since_ns), end_plans(EventCode.SETPOINT_RESPONSE, text + describe_overrun(tick, parameters))
+
+
+def _describe_approach(observation: TickObservation, change: VelocityChangeState, response: ResponseState) -> str:
+    """Return in words the limit before which setpoints do not slow the vehicle down; empty if none."""
+    count = response.baseline[0]
+    if change.velocity_wrong_ns is not None or not change.samples or not count:
+        return ""
+    first, last = change.samples[0], change.samples[-1]
+    if last[0] - first[0] < SPAN_NS:
+        return ""
+    s = (last[0] - first[0]) * 1e-9
+    # asked = -(Δm / T + d), got = -Δv / T, both outward, with the mean push d
+    north, east, down = last[1]
+    for approach in list_approaches(observation.tick, observation.parameters, (north, east, down)):
+        if approach.speed_mps < LEAST_MPS or approach.distance_m > LEFT_S * approach.speed_mps:
+            continue
+        axis, outward = approach.axis, math.copysign(1.0, last[1][approach.axis])
+        asked_mps2 = -outward * ((last[3][axis] - first[3][axis]) / s + response.baseline[1 + axis] / count)
+        got_mps2 = -outward * (last[1][axis] - first[1][axis]) / s
+        if asked_mps2 >= ASKED_MPS2 and got_mps2 < PART * asked_mps2:
+            return (
+                f"setpoints ask for {asked_mps2:.1f} m/s² before the {approach.limit} limit, and the vehicle brakes by "
+                f"{got_mps2:.1f} m/s²: it does not answer them, or a strong wind has set in"
+            )
+    return ""
