@@ -7,6 +7,8 @@ the first 200 steps and after them, with its 95 % interval, and the mean cost of
 With `--before 600` the ages of so many steps before the flight are counted too, and further cells are flown whose link
 on the ground is another one.
 
+With `--design 0.6` the scheme is designed for 60 % independent losses.
+
     python tools/other_links.py [--axes 2] [--runs 8] [--steps 2200] [--seed 1] [--budgets configured] [--cells AR]
 """
 
@@ -129,6 +131,14 @@ def draw_noise(kind: str, shape: tuple[int, int], rng: np.random.Generator) -> A
     return noise
 
 
+def draw_run(cell: Cell, steps: int, problem: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Draw which positions of a run arrive (steps,), and its disturbances (steps, n_w)."""
+    arrived = draw_arrivals(cell.loss, cell.burst, steps, rng)
+    if cell.then is not None:
+        arrived[steps // 2 :] = draw_arrivals(*cell.then, steps - steps // 2, rng)
+    return arrived, math.sqrt(problem.plant.w[0, 0]) * draw_noise(cell.noise, (steps, problem.plant.n_w), rng)
+
+
 def fly(
     solver: ConditionedSolver, cell: Cell, steps: int, rng: np.random.Generator, budgets: str, steps_before: int = 0
 ) -> tuple[Array, Array]:
@@ -137,10 +147,7 @@ def fly(
     problem, plant = solver.problem, solver.problem.plant
     covs = propagate_covariance(plant, steps)
     choice, ages, loop = make_level_choice(solver, ALLOWED), AgeRecord(), LoopState()
-    arrived = draw_arrivals(cell.loss, cell.burst, steps, rng)
-    if cell.then is not None:
-        arrived[steps // 2 :] = draw_arrivals(*cell.then, steps - steps // 2, rng)
-    noise = math.sqrt(plant.w[0, 0]) * draw_noise(cell.noise, (steps, plant.n_w), rng)
+    arrived, noise = draw_run(cell, steps, problem, rng)
     if steps_before:
         silence = 0
         for is_there in draw_arrivals(*(cell.before or (cell.loss, cell.burst)), steps_before, rng):
@@ -196,12 +203,15 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--steps", type=int, default=2200)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--design", type=float, default=0.3, help="share of independent losses of the design")
     parser.add_argument("--budgets", choices=("observed", "certificate", "configured"), default="observed")
     parser.add_argument("--before", type=int, default=0, help="steps before the flight whose ages count")
     parser.add_argument("--cells", default="", help="fly only cells with this in their names")
     given = parser.parse_args()
     adapts = given.budgets != "configured"
-    solver = ConditionedSolver(make_problem(given.axes), bernoulli(np.array([0.7])), ALLOWED, has_lower_levels=adapts)
+    solver = ConditionedSolver(
+        make_problem(given.axes), bernoulli(np.array([1.0 - given.design])), ALLOWED, has_lower_levels=adapts
+    )
     sys.stdout.write(f"| cell | first {SETTLED} steps outside | after | cost |\n|---|---|---|---|\n")
     cells = (*CELLS, *(GROUND_CELLS if given.before else ()))
     for cell in (cell for cell in cells if given.cells in cell.name):

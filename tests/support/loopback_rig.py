@@ -15,7 +15,7 @@ from uavctl.config.load import dump_config
 from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
 from uavctl.records import Header, Record, Sink
-from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.conditioned.design import AnyDesign
 
 R = TypeVar("R", bound=Record)
 

@@ -25,7 +25,7 @@ from uavctl.constraint_names import name_constraints
 from uavctl.errors import ConfigError, UavctlError, UsageError, need
 from uavctl.smpc.answer import Answer, Solver
 from uavctl.smpc.batch import BatchController, Information
-from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import Plant

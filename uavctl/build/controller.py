@@ -32,14 +32,8 @@ from uavctl.flight.risk_state import RiskParameters
 from uavctl.flight.yaw import YawMode, YawParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
-from uavctl.smpc.conditioned.planner import (
-    AnyDesign,
-    ConditionedDesign,
-    ConditionedSolver,
-    make_conditioned_id,
-    make_conditioned_record,
-    make_level_choice,
-)
+from uavctl.smpc.conditioned.design import AnyDesign, ConditionedDesign, make_conditioned_id, make_conditioned_record
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_level_choice
 from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference

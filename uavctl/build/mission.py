@@ -14,7 +14,7 @@ from uavctl.constraint_names import ConstraintNames, name_constraints
 from uavctl.errors import DesignError
 from uavctl.flight.mission import Fence, Mission, RestRegion, Trajectory, Waypoint, make_hold_mission
 from uavctl.flight.trajectory import PlantMotion, follow_positions, make_rest_region, plan_along
-from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope, find_equilibria
 

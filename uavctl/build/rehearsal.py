@@ -24,7 +24,7 @@ from uavctl.flight.controller import Controller
 from uavctl.flight.mission import Mission, advance_mission, make_question
 from uavctl.records import Vector
 from uavctl.smpc.answer import Preview
-from uavctl.smpc.conditioned.planner import ConditionedDesign
+from uavctl.smpc.conditioned.design import ConditionedDesign
 from uavctl.smpc.plant import AXES, Plant
 
 MAX_STEPS = 2400  # two minutes at steps of 0.05 s; a step takes milliseconds

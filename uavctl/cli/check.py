@@ -46,7 +46,7 @@ from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.mavlink.connection import make_links
 from uavctl.records import Checked, Datagram, Sink
-from uavctl.smpc.conditioned.planner import ConditionedDesign
+from uavctl.smpc.conditioned.design import ConditionedDesign
 
 MOVE_LIMIT_S = 120.0  # for the guided movements, beside the listening
 

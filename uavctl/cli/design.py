@@ -43,7 +43,7 @@ from uavctl.lab.flight_risk import FlightRisk
 from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign, make_conditioned_record
+from uavctl.smpc.conditioned.design import AnyDesign, ConditionedDesign, make_conditioned_record
 from uavctl.smpc.hahn_stursberg.design import Design, design_record
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 

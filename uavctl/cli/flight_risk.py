@@ -12,7 +12,7 @@ from uavctl.cli.common import SEED, make_progress
 from uavctl.config import Config
 from uavctl.config.connections import MAX_REHEARSALS
 from uavctl.lab.flight_risk import FlightRisk, rehearse_flights
-from uavctl.smpc.conditioned.planner import ConditionedDesign
+from uavctl.smpc.conditioned.design import ConditionedDesign
 
 Rehearsals = Annotated[
     int | None,

@@ -13,7 +13,7 @@ from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import LAND_PERIODS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
-from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.plant import AXES
 
 DOWN = 2

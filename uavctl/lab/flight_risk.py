@@ -38,7 +38,7 @@ from uavctl.lab.campaign.position_filter import FilterBelief, PositionFilter
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.batch import Counts
-from uavctl.smpc.conditioned.planner import ConditionedDesign
+from uavctl.smpc.conditioned.design import ConditionedDesign
 from uavctl.smpc.plant import Plant
 
 CONFIDENCE = 0.95  # of the bound of the probability

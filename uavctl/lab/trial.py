@@ -28,7 +28,7 @@ from uavctl.lab.figure_eight import CENTRE_M, make_figure_eight, to_vec3
 from uavctl.lab.position_loop import MotionPath, MotionPoint, PositionLoopFlyer, PositionLoopTuning
 from uavctl.loop import ControlLoop
 from uavctl.records import ControlMode, Decision, Flyer, Plan, Received, Record, Send, Setpoint, Vec3
-from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.plant import AXES
 

@@ -21,7 +21,7 @@ from uavctl.config.types import CostConfig
 from uavctl.errors import UsageError
 from uavctl.lab.trial import get_room_limits
 from uavctl.records import Vec3
-from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.plant import AXES
 
 DOWN = 2
