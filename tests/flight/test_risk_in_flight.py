@@ -192,8 +192,8 @@ def test_while_one_axis_leads_beside_a_wall_the_other_one_is_not_moved_by_the_bu
     assert all(east > 0.9 * north for north, east, _ in before[1:4])
 
 
-def test_by_default_and_in_recordings_of_before_the_budgets_are_the_configured_ones() -> None:
-    assert build_controller(load_config("room")).risk is None
+def test_by_default_the_budgets_follow_the_link_and_in_recordings_of_before_they_do_not() -> None:
+    assert load_config("room").risk == load_room().risk
     assert build_controller(load_config("room-hahn-stursberg")).risk is None
     keys = ("adapt =", "budgets =", "from_first_position =")
     text = "\n".join(line for line in dump_config(load_config("room")).splitlines() if not line.startswith(keys))

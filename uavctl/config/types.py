@@ -336,7 +336,7 @@ class RiskConfig(Section, frozen=True, kw_only=True):
             "`[link]`; `certificate` holds on any link, further away from limits; `configured` holds on a link as in "
             "`[link]` alone"
         ),
-    ] = "configured"
+    ] = "observed"
     adapt: Annotated[
         bool,
         Meta(
