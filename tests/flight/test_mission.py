@@ -25,6 +25,7 @@ from uavctl.flight.mission import (
     Waypoint,
     advance_mission,
     find_target,
+    is_led,
     is_over,
     lead_with_one_axis,
     make_question,
@@ -137,9 +138,12 @@ def test_one_axis_leads_for_a_time_where_the_first_motion_begins_and_never_again
     led = lead_with_one_axis(mission, stay_at(at_rest, end, 3 * DT_NS), begin, 3 * DT_NS)
     targets = [make_question(mission, led, number * DT_NS)[0].tolist() for number in (3, 4, 5)]
     assert targets == [list(region.find_equilibrium((0.0, 2.0, 0.0)))] * 2 + [list(end)]
+    assert [is_led(mission, led, number * DT_NS) for number in (3, 4, 5)] == [True, True, False]
+    assert not is_led(mission, at_rest, 3 * DT_NS)
     assert find_target(mission, led, 3 * DT_NS) == end
     ordered = stay_at(led, back, 4 * DT_NS)
     assert lead_with_one_axis(mission, ordered, begin, 4 * DT_NS) == ordered
+    assert not is_led(mission, ordered, 4 * DT_NS)
     assert make_question(mission, ordered, 4 * DT_NS)[0].tolist() == list(back)  # an order is obeyed at once
     assert make_question(replace(mission, lead_ns=0), led, 3 * DT_NS)[0].tolist() == list(end)
 

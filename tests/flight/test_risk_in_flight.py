@@ -18,7 +18,7 @@ from uavctl.flight.risk_state import RiskGroup
 from uavctl.flight.state import ControlState
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
-from uavctl.records import RiskRecord, StepInput
+from uavctl.records import Plan, RiskRecord, StepInput, Vec3
 from uavctl.smpc.conditioned.adaptation import MAX_WIDENING, AgeRecord, LoopState, charge_risk, count_age
 
 STEPS = 300
@@ -30,9 +30,15 @@ def load_room(*overrides: str) -> Config:
 
 
 def fly(
-    config: Config, seed: int, ground_ticks: int = 0, loss: tuple[float, float] = (0.1, 0.8), silent: range = range(0)
+    config: Config,
+    seed: int,
+    ground_ticks: int = 0,
+    loss: tuple[float, float] = (0.1, 0.8),
+    silent: range = range(0),
+    begins_m: Vec3 = (2.4, 0.0, -1.2),
+    steps: int = STEPS,
 ) -> tuple[list[StepInput], list[TickOutput]]:
-    """Fly from 0.5 m beside the target, with runs of five lost positions in the mean.
+    """Fly from 0.5 m beside the target, or from another place, with runs of five lost positions in the mean.
 
     Args:
         ground_ticks: Ticks before the flight, with the same link.
@@ -41,9 +47,9 @@ def fly(
     """
     controller, rng = build_controller(config), np.random.default_rng(seed)
     plant, state, inputs, outputs = controller.plant, make_initial_state(), [], []
-    x, is_bad = plant.equilibrium((2.4, 0.0, -1.2)), False
+    x, is_bad = plant.equilibrium(begins_m), False
     waiting = []
-    for tick in range(ground_ticks + STEPS):
+    for tick in range(ground_ticks + steps):
         at_ns = START_NS + tick * controller.tick_ns
         is_bad = bool(rng.random() < loss[is_bad])
         if not is_bad and tick not in silent:
@@ -165,8 +171,29 @@ def test_a_source_that_is_off_before_the_flight_says_nothing_of_the_link() -> No
     assert waited[-1].level > 0
 
 
-def test_by_default_and_in_recordings_of_before_the_budgets_are_the_configured_ones() -> None:
-    assert build_controller(load_config("room")).risk is None
+def test_while_one_axis_leads_beside_a_wall_the_other_one_is_not_moved_by_the_budgets() -> None:
+    """Else a frame whose axes are swapped shows nothing: both axes accelerate alike, along the diagonal."""
+    lead_s, no_loss = 0.3, (0.0, 0.0)
+
+    def list_plans(*overrides: str) -> list[Plan]:
+        config = load_room("target.position_m=[1.0, 1.0, -1.2]", f"envelope.lead_s={lead_s}", *overrides)
+        _, outputs = fly(config, 5, loss=no_loss, begins_m=(-1.9, -2.4, -1.2), steps=20)
+        return [output.plan for output in outputs if output.plan is not None]
+
+    def list_first_inputs(plans: list[Plan]) -> list[list[float]]:
+        ends_ns = plans[0].base_ns + round(lead_s * 1e9)
+        return [plan.inputs[0].tolist() for plan in plans if plan.base_ns < ends_ns]
+
+    led = list_first_inputs(list_plans())
+    assert len(led) == 6
+    assert led == list_first_inputs(list_plans("risk.budgets=configured"))
+    assert all(abs(east) < 0.2 * north for north, east, _ in led[1:])
+    before = list_first_inputs(list_plans("risk.from_first_position=false"))  # as in recordings of before
+    assert all(east > 0.9 * north for north, east, _ in before[1:4])
+
+
+def test_by_default_the_budgets_follow_the_link_and_in_recordings_of_before_they_do_not() -> None:
+    assert load_config("room").risk == load_room().risk
     assert build_controller(load_config("room-hahn-stursberg")).risk is None
     keys = ("adapt =", "budgets =", "from_first_position =")
     text = "\n".join(line for line in dump_config(load_config("room")).splitlines() if not line.startswith(keys))

@@ -202,6 +202,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         cov=cov,
         filter_plant=estimator_plant,
         has_lower_levels=for_flight and config.risk.budgets != "configured",
+        bounds_widening=config.risk.from_first_position,
     )
     return ConditionedDesign(solver, cov, make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))
 

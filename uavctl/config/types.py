@@ -336,7 +336,7 @@ class RiskConfig(Section, frozen=True, kw_only=True):
             "`[link]`; `certificate` holds on any link, further away from limits; `configured` holds on a link as in "
             "`[link]` alone"
         ),
-    ] = "configured"
+    ] = "observed"
     adapt: Annotated[
         bool,
         Meta(
@@ -347,8 +347,10 @@ class RiskConfig(Section, frozen=True, kw_only=True):
     from_first_position: Annotated[
         bool,
         Meta(
-            description="count the ages of positions from the first one on, also before the flight, and adapt slowly "
-            "where no limit is near; `false`, as in recordings of before: from the flight on, quickly everywhere"
+            description="count the ages of positions from the first one on, also before the flight; adapt slowly where "
+            "no limit is near, leave half of the room between opposite limits, and while one axis leads plan with the "
+            "configured budgets; `false`, as in recordings of before: from the flight on, quickly everywhere, without "
+            "these bounds"
         ),
     ] = True
 

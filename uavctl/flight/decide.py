@@ -33,7 +33,7 @@ from uavctl.flight.fallback import (
 )
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
-from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
+from uavctl.flight.mission import MissionState, advance_mission, is_led, is_over, lead_with_one_axis, make_question
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
@@ -268,6 +268,8 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
     mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
     target, preview = make_question(controller.mission, mission, context.boundary_ns)
+    is_first = is_led(controller.mission, mission, context.boundary_ns)
+    preview = set_risk(preview, phase.state.risk, controller.risk, is_led=is_first)
     preview = _complete_preview(preview, base, cov, phase)
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask_solver(controller.solver, context.step, base, target, preview, shape, controller.design_id)
@@ -290,7 +292,6 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
     controller = phase.controller
     # u = u_sent + d: the solver counts what acts on the plant in all
     sent = controller.plant.to_input(phase.state.plan.sent_mps2)
-    preview = set_risk(preview, phase.state.risk, controller.risk)
     return msgspec.structs.replace(
         preview,
         age=min(phase.view.age_steps or 0, controller.late_steps),

@@ -195,6 +195,14 @@ def lead_with_one_axis(mission: Mission, state: MissionState, estimate: Vector, 
     return state if leading_target is None else replace(state, lead=Lead(at_ns, target, leading_target))
 
 
+def is_led(mission: Mission, state: MissionState, at_ns: int) -> bool:
+    """Whether one horizontal axis leads at a boundary."""
+    lead = state.lead
+    if lead is None or at_ns - lead.at_ns >= mission.lead_ns:
+        return False
+    return lead.target == find_target(mission, state, at_ns)
+
+
 def is_over(mission: Mission, state: MissionState, at_ns: int) -> bool:
     """Whether all of the mission has been flown, the last waypoint's time too."""
     if state.stay is not None:
@@ -225,9 +233,8 @@ def find_target(mission: Mission, state: MissionState, at_ns: int) -> Vector:
 def make_question(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Preview]:
     """Make the question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
     limits = _compute_limits(mission, at_ns - state.start_ns + mission.dead_ns)
-    lead = state.lead
-    if lead is not None and at_ns - lead.at_ns < mission.lead_ns and lead.target == find_target(mission, state, at_ns):
-        return np.array(lead.leading_target), Preview(limits=limits)
+    if state.lead is not None and is_led(mission, state, at_ns):
+        return np.array(state.lead.leading_target), Preview(limits=limits)
     if state.stay is not None:
         return np.array(state.stay), Preview(limits=limits)
     trajectory = mission.trajectory

@@ -18,7 +18,7 @@ from uavctl.flight.mission import MissionState, find_limits
 from uavctl.flight.risk_state import RiskGroup, RiskParameters
 from uavctl.flight.supervise import Supervised
 from uavctl.records import Event, Plan, RiskRecord, Severity
-from uavctl.smpc.answer import CERTIFICATE_LEVEL, Preview
+from uavctl.smpc.answer import CERTIFICATE_LEVEL, CONFIGURED_LEVEL, Preview
 from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
 
 # The first positions of a source do not show its clock yet: a few round trips take two seconds, and the smallest delay
@@ -26,11 +26,18 @@ from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk
 SETTLING_NS = 2_000_000_000
 
 
-def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | None) -> Preview:
-    """Set the level and the spread of a plan."""
+def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | None, *, is_led: bool) -> Preview:
+    """Set the level and the spread of a plan.
+
+    Args:
+        is_led: Whether one horizontal axis leads. Beside a limit the budgets of a lower level move the other one as
+            well: then a frame whose axes are swapped shows nothing along the diagonal.
+    """
     if parameters is None:
         return preview
     level = risk.ages.level if parameters.budgets == "observed" else CERTIFICATE_LEVEL
+    if is_led and parameters.from_first_position:
+        level = CONFIGURED_LEVEL
     if not parameters.adapts:
         return msgspec.structs.replace(preview, level=level)
     return msgspec.structs.replace(

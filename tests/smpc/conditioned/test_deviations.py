@@ -11,7 +11,8 @@ from baseline_rig import problem
 from uavctl.build.controller import build_conditioned, build_controller, build_estimator, build_problem
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman, settle_covariance
-from uavctl.smpc.conditioned.backoffs import RowDeviations
+from uavctl.smpc.answer import Preview
+from uavctl.smpc.conditioned.backoffs import RowDeviations, bound_widening, find_opposite_rows
 from uavctl.smpc.estimate import add_bias, innovation_form
 from uavctl.smpc.nominal import find_parts
 
@@ -69,3 +70,47 @@ def test_a_design_uses_the_covariance_of_the_flight_s_filter(preset: str) -> Non
     )
     index = list(controller.plant.velocity_index)
     assert (np.diagonal(design.estimate_cov)[index] < np.diagonal(deaf)[index]).all()
+
+
+def test_widened_back_offs_leave_half_of_the_room_between_opposite_limits() -> None:
+    rng = np.random.default_rng(5)
+    steps = 8
+    c = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 1.0]])  # the first and the third one are opposite
+    b, quantiles = np.array([3.0, 2.0, 1.0, 4.0]), rng.uniform(0.0, 3.0, (steps, 1))
+    plain = rng.uniform(0.0, 1.0, (steps, 4))
+    opposite = find_opposite_rows(c)
+    assert opposite.tolist() == [[0, 2]]
+    assert bound_widening(plain, plain, quantiles, b, opposite).tolist() == plain.tolist()
+    bounded = bound_widening(4.0 * plain, plain, quantiles, b, opposite)
+    assert bounded[:, [1, 3]].tolist() == (4.0 * plain)[:, [1, 3]].tolist()
+    is_bounded = []
+    for stage in range(steps):
+        factors = bounded[stage] / plain[stage]
+        taken, before_m = (float(quantiles[stage, 0] * values[stage, [0, 2]].sum()) for values in (bounded, plain))
+        assert factors[0] == pytest.approx(factors[2])
+        if factors[0] == pytest.approx(4.0):
+            assert taken <= max(2.0, before_m)
+        else:  # half of 4, or as before where that takes more
+            assert taken == pytest.approx(max(2.0, before_m))
+            assert factors[0] >= 1.0 - 1e-12
+        is_bounded.append(factors[0] < 3.9)
+    assert any(is_bounded) and not all(is_bounded)
+
+
+def test_without_bounds_on_widening_a_plan_is_that_of_before() -> None:
+    """Recordings without the key replay so."""
+    observed = ["risk.budgets=observed"]
+    bounded, free = (
+        build_conditioned(load_config("room-px4", [*observed, f"risk.from_first_position={value}"])).solver
+        for value in ("true", "false")
+    )
+    target = bounded.problem.target
+    state = target + bounded.problem.plant.equilibrium((0.5, 0.0, 0.0))
+    slack = {}
+    for widening in (1.0, 4.0):
+        preview = Preview(level=0, widening=widening)
+        plans = [solver.solve(0, state, target, preview) for solver in (bounded, free)]
+        slack[widening] = [plan.slack for plan in plans]
+        assert (plans[0].inputs.tobytes() == plans[1].inputs.tobytes()) == (widening == 1.0)
+    # No plan is inside of limits whose back-offs cross.
+    assert slack[4.0][0] == 0.0 < slack[4.0][1]

@@ -42,9 +42,14 @@ from uavctl.smpc.sets import find_pairs
 AGE_EXPONENT = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
 MAX_RISK = 0.5  # largest risk of a row: with more, the mean would be outside of its limit
 MIN_RISK = 1e-9  # least remainder of the allowed risk, as a share of it: a smaller one is rounding
+TINY = 1e-300  # least divisor
 MAX_VARIANCE = 1e12  # largest variance along a row: a program takes a back-off of 1e30 for no limit
 ROUNDING = 1e-9  # largest rounding of a variance, as a share of the largest entry of its covariance
 RARE_SHARE = 0.05  # share of the allowed risk that the oldest ages, without back-offs, may use in transit
+
+# Share of the room between opposite limits that widened back-offs may take. A spread that takes more tells of a wrong
+# model, and plans that have to be at rest within it brake too hard
+WIDENED_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +152,7 @@ def _compute_age_probabilities(link: AgeModel, steps: int, allowed: float) -> tu
 
 
 Flags = NDArray[np.bool_]
+Index = NDArray[np.intp]
 
 _KEPT_SHARE = 0.5  # share of the margin beyond its back-off that a row which does not bind keeps
 _MAX_DEVIATIONS = -float(ndtri(1e-6))  # most deviations that a row which does not bind keeps
@@ -165,6 +171,36 @@ def compute_violation_risk(margin: Array, sigma: Array) -> Array:
         return np.asarray(ndtr(margin / -sigma))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(sigma > 0.0, ndtr(-margin / sigma), np.where(margin < 0.0, 1.0, 0.0))
+
+
+def find_opposite_rows(c: Array) -> Index:
+    """Find the pairs (n, 2) of opposite rows c'x <= b_i, -c'x <= b_j."""
+    pairs = [[row for _, row in pair.sides] for pair in find_pairs(c)]
+    return np.array([rows for rows in pairs if len(rows) == 2], dtype=np.intp).reshape(-1, 2)
+
+
+def bound_widening(sigma: Array, plain: Array, quantiles: Array, b: Array, opposite: Index) -> Array:
+    """Bound widened deviations so that their back-offs leave room between opposite limits.
+
+    Args:
+        sigma: Widened standard deviations (H, m).
+        plain: Those of before (H, m).
+        quantiles: Standard deviations (H, 1) that a row keeps.
+        b: Right sides (m,).
+        opposite: Pairs (n, 2) of opposite rows.
+    """
+    first, second = opposite.T
+    # s (β_ti + β_tj) <= max(β⁰_ti + β⁰_tj, (b_i + b_j) / 2), with β = κ σ and s <= 1
+    widened, least = (quantiles * (values[:, first] + values[:, second]) for values in (sigma, plain))
+    most = np.maximum(least, WIDENED_SHARE * (b[first] + b[second]))
+    is_beyond = widened > most
+    if not np.count_nonzero(is_beyond):
+        return sigma
+    scale = np.where(is_beyond, most / np.maximum(widened, TINY), 1.0)
+    bounded = sigma.copy()
+    bounded[:, first] *= scale
+    bounded[:, second] *= scale
+    return bounded
 
 
 def find_binding(backoff: Array, margin: Array, sigma: Array) -> Flags:
@@ -214,9 +250,6 @@ def reallocate_to_rows(
 def _make_ones(count: int) -> Array:
     """Make a vector of ones: a product with it is faster than a sum of flags."""
     return np.ones(count)
-
-
-Index = NDArray[np.intp]
 
 
 class RowDeviations:

@@ -51,10 +51,12 @@ from uavctl.smpc.conditioned.backoffs import (
     RowDeviations,
     allocate_by_age,
     allocate_equally,
+    bound_widening,
     compute_quantile,
     compute_reference_backoffs,
     compute_violation_risk,
     find_binding,
+    find_opposite_rows,
     reallocate_to_rows,
 )
 from uavctl.smpc.conditioned.program import PartProgram, ReferenceEquilibria, RegulatedRows, SlewRows
@@ -62,7 +64,7 @@ from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import OPEN
-from uavctl.smpc.sets import find_equilibria, find_pairs
+from uavctl.smpc.sets import find_equilibria
 
 METHOD = "age-conditioned"
 ROUNDS = 2  # rounds of an allocation
@@ -139,6 +141,7 @@ class ConditionedSolver:
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
         has_lower_levels: Whether there are levels of the budgets below that of the configured link.
+        bounds_widening: Whether widening leaves a plan some room between opposite limits, see `bound_widening`.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
@@ -156,6 +159,7 @@ class ConditionedSolver:
         filter_plant: Plant | None = None,
         *,
         has_lower_levels: bool = False,
+        bounds_widening: bool = True,
     ) -> None:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
@@ -177,6 +181,8 @@ class ConditionedSolver:
         ]
         self._in_order = bool((self._rows == np.arange(problem.state_set.b.size)).all())
         self._c, self._b = problem.state_set.c[self._rows], problem.state_set.b[self._rows]
+        opposite = find_opposite_rows(self._c)
+        self._opposite = opposite if bounds_widening else opposite[:0]
         self._equilibria = find_equilibria(
             plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp)
         )
@@ -389,11 +395,9 @@ class ConditionedSolver:
         cov_bytes = b"" if preview.cov is None else preview.cov.tobytes()
         key = in_transit, preview.level, preview.age, preview.widening, preview.silence_widening, cov_bytes
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
-            sigma, age = self._deviations.compute(preview.cov), preview.age
-            if preview.widening != 1.0:
-                sigma = preview.widening * sigma
-            if preview.silence_widening != 1.0:
-                sigma[len(sigma) - 1 - age :] *= preview.silence_widening
+            plain, age = self._deviations.compute(preview.cov), preview.age
+            sigma = bound_widening(preview.widening * plain, plain, allocation.quantiles[age], self._b, self._opposite)
+            sigma[len(sigma) - 1 - age :] *= preview.silence_widening
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
             backoff = allocation.quantiles[age] * sigma
             self._cached_backoffs = (
@@ -428,10 +432,8 @@ class ConditionedSolver:
         needed = float(compute_quantile(np.array(allowed / max(1, self._rows.size)))) * sigma
         # β_ti + β_tj <= b_i + b_j for c_i = -c_j
         is_possible = np.ones(len(sigma), dtype=np.bool_)
-        for pair in find_pairs(self._c):
-            if len(pair.sides) == 2:  # opposite limits
-                rows = [row for _, row in pair.sides]
-                is_possible &= needed[:, rows].sum(axis=1) <= self._b[rows].sum()
+        for rows in find_opposite_rows(self._c):
+            is_possible &= needed[:, rows].sum(axis=1) <= self._b[rows].sum()
         return int(np.logical_and.accumulate(is_possible).sum())
 
     def _select_position_deviations(self) -> Array:
