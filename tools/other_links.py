@@ -210,7 +210,11 @@ def main() -> None:
     given = parser.parse_args()
     adapts = given.budgets != "configured"
     solver = ConditionedSolver(
-        make_problem(given.axes), bernoulli(np.array([1.0 - given.design])), ALLOWED, has_lower_levels=adapts
+        make_problem(given.axes),
+        bernoulli(np.array([1.0 - given.design])),
+        ALLOWED,
+        has_lower_levels=adapts,
+        bounds_slack=not adapts,
     )
     sys.stdout.write(f"| cell | first {SETTLED} steps outside | after | cost |\n|---|---|---|---|\n")
     cells = (*CELLS, *(GROUND_CELLS if given.before else ()))

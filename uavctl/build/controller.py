@@ -194,6 +194,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
     elif cov is None:
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
+    adapts = for_flight and config.risk.budgets != "configured"
     solver = ConditionedSolver(
         problem,
         link,
@@ -201,7 +202,8 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         slew_mps3=slew_mps3,
         cov=cov,
         filter_plant=estimator_plant,
-        has_lower_levels=for_flight and config.risk.budgets != "configured",
+        has_lower_levels=adapts,
+        bounds_slack=not (adapts and config.risk.adapt and config.risk.from_first_position),
         bounds_widening=config.risk.from_first_position,
     )
     return ConditionedDesign(solver, cov, make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))

@@ -23,7 +23,9 @@ LOSS = 0.3
 @pytest.fixture(scope="module")
 def solver() -> ConditionedSolver:
     problem = build_problem(load_config("paper", ["smpc.scheme=age-conditioned", "target.position_m=[0, 19, 0]"]))
-    return ConditionedSolver(problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_lower_levels=True)
+    return ConditionedSolver(
+        problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_lower_levels=True, bounds_slack=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,7 @@ def test_higher_levels_give_old_information_more_and_cost_less(solver: Condition
 
 def test_without_a_level_a_plan_is_that_of_the_configured_link(solver: ConditionedSolver) -> None:
     state, target = np.array([0.0, 0.0, 17.0, 0.0]), solver.problem.target
-    plain = ConditionedSolver(solver.problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED)
+    plain = ConditionedSolver(solver.problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, bounds_slack=False)
     assert plain.solve(0, state, target).inputs.tobytes() == solver.solve(0, state, target).inputs.tobytes()
 
 

@@ -39,7 +39,9 @@ def draw_disturbances(kind: str, steps: int, rng: np.random.Generator) -> Array:
 def make_solver(target: str) -> ConditionedSolver:
     config = load_config("paper", ["smpc.scheme=age-conditioned", f"target.position_m={target}"])
     problem = build_problem(config)
-    return ConditionedSolver(problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_lower_levels=True)
+    return ConditionedSolver(
+        problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_lower_levels=True, bounds_slack=False
+    )
 
 
 def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapts: bool) -> Array:

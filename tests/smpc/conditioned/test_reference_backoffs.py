@@ -28,12 +28,20 @@ def steps_for(loss: float) -> int:
     return 56 if loss > 0.8 else 24
 
 
-def distances(link: AgeModel, steps: int, cov: Array | None = None, slew_mps3: float = np.inf, most: int = 1) -> Array:
+def distances(
+    link: AgeModel,
+    steps: int,
+    cov: Array | None = None,
+    slew_mps3: float = np.inf,
+    most: int = 1,
+    *,
+    bounds_slack: bool = True,
+) -> Array:
     case = replace(problem("paper"), horizon=steps)
     deviations = np.sqrt([EAST[0] @ item @ EAST[0] for item in propagate_covariance(case.plant, steps)[1:]])
     risk = allocate_by_age(link, deviations, ALLOWED, n_binding=2)
     slew = SlewRows(case.plant, case.input_set, slew_mps3)
-    return compute_reference_backoffs(case, risk, ALLOWED, slew, EAST, cov, most)
+    return compute_reference_backoffs(case, risk, ALLOWED, slew, EAST, cov, most, bounds_slack=bounds_slack)
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.6, 0.9])
@@ -82,6 +90,16 @@ def test_in_bursts_rest_at_all_ages_is_outside_as_often_as_allowed() -> None:
     assert risk.age_probabilities @ norm.cdf(-d / sigma(20, np.zeros((4, 4)))) == pytest.approx(
         ALLOWED - risk.older_probability, rel=1e-6
     )
+
+
+@pytest.mark.parametrize("loss", [0.3, 0.6])
+def test_without_a_bound_on_slack_only_rest_at_all_ages_counts(loss: float) -> None:
+    link, steps = bernoulli(np.array([1.0 - loss])), steps_for(loss)
+    (d,) = distances(link, steps, bounds_slack=False)[0]
+    risk = allocate_by_age(link, sigma(steps, np.zeros((4, 4))), ALLOWED, n_binding=2)
+    outside = float(risk.age_probabilities @ norm.cdf(-d / sigma(steps, np.zeros((4, 4)))))
+    assert outside == pytest.approx(ALLOWED - risk.older_probability, rel=1e-6)
+    assert d < distances(link, steps)[0, 0]
 
 
 def test_sharing_estimate_errors_and_a_slow_gate_need_more_distance() -> None:

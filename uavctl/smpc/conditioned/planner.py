@@ -141,6 +141,7 @@ class ConditionedSolver:
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
         has_lower_levels: Whether there are levels of the budgets below that of the configured link.
+        bounds_slack: Whether new plans beside a limit may seldom need slack, see `compute_reference_backoffs`.
         bounds_widening: Whether widening leaves a plan some room between opposite limits, see `bound_widening`.
 
     Raises:
@@ -159,6 +160,7 @@ class ConditionedSolver:
         filter_plant: Plant | None = None,
         *,
         has_lower_levels: bool = False,
+        bounds_slack: bool = True,
         bounds_widening: bool = True,
     ) -> None:
         self.problem = problem
@@ -206,7 +208,15 @@ class ConditionedSolver:
             ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
             budgets, reference_backoffs = risk.row_budgets[ages], np.zeros((n_parts, width))
             reference_backoffs[:, self._reference_rows] = compute_reference_backoffs(
-                problem, risk, allowed, self._slew, self._c[self._reference_rows], cov, n_parts, self.filter_plant
+                problem,
+                risk,
+                allowed,
+                self._slew,
+                self._c[self._reference_rows],
+                cov,
+                n_parts,
+                self.filter_plant,
+                bounds_slack=bounds_slack,
             )
             equal_budgets = budgets / max(1, width)
             return _Allocation(
