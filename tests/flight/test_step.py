@@ -100,7 +100,7 @@ def test_engages_at_a_boundary_and_lets_go_at_once() -> None:
 def test_a_missed_boundary_is_decided_in_the_next_tick_as_it_would_have_been_then() -> None:
     solver = StubSolver(small_plant())
     punctual, late = make_controller(), make_controller(solver)
-    after_the_boundary = sample(boundary_ns(2) + 10 * MS, position_m=(0.3, 0.0, 0.0))
+    after_the_boundary = sample(boundary_ns(2) + 10 * MS, position_m=(0.01, 0.0, 0.0))
     samples = [*make_step_samples(), after_the_boundary]
     missing = [tick for tick in range(3 * TICKS) if tick != 2 * TICKS]
     on_time = run(punctual, make_inputs(range(3 * TICKS), samples))

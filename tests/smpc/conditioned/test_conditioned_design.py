@@ -81,7 +81,7 @@ def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys
 @pytest.mark.usefixtures("_no_other_design", "no_page")
 def test_places_that_the_scheme_cannot_rest_at_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["loopback", "--config", quick(tmp_path), "--duration", "1", "--out", str(tmp_path / "flight")]
-    assert main([*arguments, "--goto", "2.985,0,-1.2"]) != 0
+    assert main([*arguments, "--goto", "2.998,0,-1.2"]) != 0
     assert "goto: " in capsys.readouterr().err
 
 
