@@ -64,6 +64,7 @@ def is_found(
     return not verdict.is_none
 
 
+@pytest.mark.fault(101)
 @pytest.mark.parametrize(("axis", "side"), LIMITS)
 def test_a_deceleration_that_does_not_come_before_a_limit_ends_the_plans(axis: int, side: float) -> None:
     assert is_found(axis, side)

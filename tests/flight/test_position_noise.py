@@ -75,7 +75,7 @@ def test_noise_is_bounded_and_needs_positions_close_to_one_another() -> None:
     wild = rng.standard_normal((30, 3))
     assert measure_noise(wild).std_m == 0.1
     far = measure_noise(wild, step_ns=5 * STEP_NS)
-    assert not far.is_known and far.std_m == 0.0
+    assert not far.is_measured and not far.is_known and far.std_m == 0.0
 
 
 @pytest.mark.parametrize(

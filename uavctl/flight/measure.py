@@ -195,7 +195,7 @@ def _gate_in_order(
             first = frozen.track_sample(sources.tracks, kalman, history, sample, np.zeros(len(kalman.axes)))
             sources = replace(sources, tracks=first)
         sources = replace(sources, jumps=jumps.note_position(sources.jumps, at_ns))
-        corrected, knew_noise = _correct_sample(sources, sample, at_ns), sources.noise.is_known
+        corrected, knew_noise = _correct_sample(sources, sample, at_ns), sources.noise.is_measured
         if belief is not None:  # else it is the first one, or too old
             sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, corrected, belief)
             if not knew_noise and sources.noise.std_m > 0.0:

@@ -33,7 +33,6 @@ This is the only table from verdicts to actions. Phase 1 acts on those about sin
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import msgspec
 from msgspec.structs import replace
@@ -62,10 +61,8 @@ from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
-from uavctl.records import ControlMode, Estimate, Order, PositionSample
+from uavctl.records import ControlMode, Estimate, Order
 
-# Noise that monitors of the motion reckon with before it is known: that of a poor camera system
-UNKNOWN_STD_M = 0.05
 # Causes after which no position is believed any more.
 POSITION_CODES = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
 ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING, EventCode.SETPOINT_RESPONSE})
@@ -268,14 +265,6 @@ def _is_return_ordered(state: ControlState, view: FilterView, context: TickConte
     return outside.is_outside(observe_motion(view.estimate, context, state.plan.sent_mps2), bounds)
 
 
-def _weigh_samples(measured: Measured) -> Sequence[PositionSample]:
-    """Return the positions of a tick as monitors of the motion count them: as noisy ones until their noise is known."""
-    accepted = measured.samples.accepted
-    if measured.samples.sources.noise.is_known:
-        return accepted
-    return [replace(sample, std_m=max(sample.std_m, UNKNOWN_STD_M)) for sample in accepted]
-
-
 def _watch_flight(
     state: ControlState, view: FilterView, measured: Measured, context: TickContext, return_ordered: bool
 ) -> tuple[MonitorState, Verdict]:
@@ -305,7 +294,7 @@ def _update_engaged(
         view.estimate,
         context,
         state.plan.sent_mps2,
-        _weigh_samples(measured),
+        measured.samples.accepted,
         is_braking=context.mode is ControlMode.BRAKE,
         inertial_mps2=None if reading is None else reading.accel_mps2,
     )
@@ -456,7 +445,7 @@ def _update_unengaged(state: ControlState, measured: Measured, context: TickCont
     if monitors.motion.tick_ns is None and reading is not None and not distrusts_positions(state):
         # The vehicle moves, and monitors that begin anew would not know how fast.
         monitors = engaged.continue_unengaged(before.engaged, reading.accel_mps2)
-    observation = observe_motion(None, context, accel_mps2, _weigh_samples(measured))
+    observation = observe_motion(None, context, accel_mps2, measured.samples.accepted)
     monitors, verdict = engaged.update(monitors, observation, bounds)
     # Once positions were wrong the vehicle's own velocity may be, too: its estimate is made of them.
     counts = not before.position_inconsistent if verdict.cause is EventCode.VELOCITY else reading is not None

@@ -32,21 +32,29 @@ _LARGEST_S2 = 0.01
 # The same for three distances and a parabola: 5 m/s³, the most that setpoints change by, make 0.02 m of it. Four
 # positions in a row at 5 Hz are close enough.
 _LARGEST_S3 = 0.025
+_Place = tuple[int, Vec3]  # capture time [ns], position [m]
 _MEDIAN_3D = 1.538  # median length of a vector of three independent values with standard deviation 1
 
 
 class NoiseTrack(msgspec.Struct, frozen=True):
     """Last positions of all sources, and what they have shown."""
 
-    last: tuple[tuple[int, Vec3], ...] = ()  # up to three: capture time [ns], position [m]
+    last: tuple[_Place, ...] = ()  # up to three
     residuals_m: tuple[float, ...] = ()  # newest last, scaled to the noise of a single position
     # Standard deviation of a position, each axis [m]; 0 where it is not known, or not above `USUAL_STD_M`
     std_m: float = 0.0
 
+    close_count: int = 0  # positions so far that lay close to their neighbours in time, at most as many as are needed
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether positions have shown their noise for long enough."""
+        return len(self.residuals_m) >= _LEAST_RESIDUALS
+
     @property
     def is_known(self) -> bool:
-        """Whether positions have come close enough to one another, and for long enough."""
-        return len(self.residuals_m) >= _LEAST_RESIDUALS
+        """Whether they have also come so close to one another that a jump is told from motion."""
+        return self.close_count >= _LEAST_RESIDUALS
 
 
 def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
@@ -54,22 +62,28 @@ def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
     if track.last and at_ns <= track.last[-1][0]:
         return track
     last, residuals_m = (*track.last, (at_ns, sample.position_m)), track.residuals_m
-    residual_m = _find_residual_m(last)
-    if residual_m is not None:
-        residuals_m = (*residuals_m, residual_m)[-_RESIDUALS:]
-    return NoiseTrack(last[-3:], residuals_m, _estimate_std_m(residuals_m))
+    neighbours = _select_neighbours(last, track.is_known)
+    if neighbours:
+        residuals_m = (*residuals_m, _find_residual_m(last[-2], neighbours))[-_RESIDUALS:]
+    close_count = min(track.close_count + (len(neighbours) == 2), _LEAST_RESIDUALS)
+    return NoiseTrack(last[-3:], residuals_m, _estimate_std_m(residuals_m), close_count)
 
 
-def _find_residual_m(last: Sequence[tuple[int, Vec3]]) -> float | None:
-    """Find how far the last position but one is off its neighbours [m]; None where they are too far apart."""
+def _select_neighbours(last: Sequence[_Place], is_known: bool) -> Sequence[_Place]:
+    """Select what the last position but one is compared with: two neighbours, or three of a slow source; else none."""
     if len(last) < 3:
-        return None
-    (middle_ns, middle_m), others = last[-2], [*last[:-2], last[-1]]
+        return ()
+    middle_ns, others = last[-2][0], [*last[:-2], last[-1]]
     times_s = [(at_ns - middle_ns) * 1e-9 for at_ns, _ in others]
     if abs(math.prod(times_s[-2:])) <= _LARGEST_S2:
-        others, times_s = others[-2:], times_s[-2:]
-    elif len(others) < 3 or math.prod(times_s) > _LARGEST_S3:
-        return None
+        return others[-2:]
+    return others if len(others) == 3 and not is_known and math.prod(times_s) <= _LARGEST_S3 else ()
+
+
+def _find_residual_m(middle: _Place, others: Sequence[_Place]) -> float:
+    """Find how far a position is off the line, or the parabola, through others, scaled to the noise of one [m]."""
+    (middle_ns, middle_m) = middle
+    times_s = [(at_ns - middle_ns) * 1e-9 for at_ns, _ in others]
     # r = p - Σ c_i p_i with c_i = Π_j t_j / (t_j - t_i), whose variance is (1 + Σ c_i²) σ²
     parts = [math.prod(t / (t - own) for t in times_s if t != own) for own in times_s]
     columns = zip(middle_m, *(place for _, place in others), strict=True)
