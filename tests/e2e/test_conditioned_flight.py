@@ -106,7 +106,8 @@ def test_by_default_it_settles_beside_a_wall_as_near_as_the_link_allows() -> Non
     places = np.array([truth.position_m[0] for truth in result.of(Truth) if truth.at_ns > 12e9])
     assert np.mean(places >= 3.0) <= 0.05
     assert max(plan.reference[0] for plan in settled) < 3.0
-    assert np.mean(places) == pytest.approx(np.mean([plan.reference[0] for plan in settled]), abs=0.05)
+    # Back-offs, not the reference, keep it away: it settles between both.
+    assert 2.85 < np.mean(places) < np.mean([plan.reference[0] for plan in settled])
 
 
 def test_a_design_may_rest_nearer_to_the_walls() -> None:
