@@ -299,7 +299,7 @@ def _judge_sample(
     error_mps = np.zeros(n_axes) if sources.velocity_error_mps is None else sources.velocity_error_mps
     width = outliers.compute_gate(reach, kalman, belief, variances, error_mps)
     outlier_track, verdict = outliers.update(sources.outliers, OutlierObservation(at_ns, offset, width, n_axes))
-    if verdict.is_none or not sources.noise.is_known:
+    if verdict.is_none or not sources.noise.is_measured:
         # The first positions may be so noisy that the others lie far from what they show.
         sources = replace(sources, noise=noise.update(sources.noise, sample, at_ns))
     if verdict.is_none:
