@@ -53,7 +53,9 @@ def test_few_positions_may_have_shown_too_little_noise(count: int, factor: float
     offsets = np.zeros((count, 3))
     offsets[::2, 0] = 0.03
     track = measure_noise(offsets)
-    assert track.std_m == pytest.approx(factor * 0.0159, rel=0.01) and track.is_known == (count > 4)
+    assert track.std_m == pytest.approx(factor * 0.0159, rel=0.01) and track.is_known == track.is_measured == (
+        count > 4
+    )
     assert measure_noise(offsets[:2]).std_m == measure_noise(0.6 * offsets).std_m == 0.0
 
 
@@ -117,6 +119,13 @@ def test_a_position_is_compared_with_the_line_between_its_neighbours(
         track = noise.update(track, make_sample(1 + ms * 1_000_000, (north, east, down)), 1 + ms * 1_000_000)
     residual_m = 0.13 / math.sqrt(1.0 + (1.0 - c) ** 2 + c**2)
     assert track.residuals_m == pytest.approx((residual_m,) if counts else ())
+
+
+def test_a_position_long_before_changes_no_line() -> None:
+    track = NoiseTrack()
+    for ms, up_m in ((0, 7.0), (5000, 0.0), (5050, 0.3), (5100, 0.0)):
+        track = noise.update(track, make_sample(1 + ms * 1_000_000, (0.0, 0.0, up_m)), 1 + ms * 1_000_000)
+    assert track.residuals_m == pytest.approx((0.3 / math.sqrt(1.5),)) and track.close_count == 1
 
 
 def test_noise_counts_above_the_usual_one() -> None:

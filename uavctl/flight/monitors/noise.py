@@ -83,9 +83,9 @@ def _select_neighbours(last: Sequence[_Place], is_known: bool) -> Sequence[_Plac
 def _find_residual_m(middle: _Place, others: Sequence[_Place]) -> float:
     """Find how far a position is off the line, or the parabola, through others, scaled to the noise of one [m]."""
     (middle_ns, middle_m) = middle
-    times_s = [(at_ns - middle_ns) * 1e-9 for at_ns, _ in others]
+    times_ns = [at_ns - middle_ns for at_ns, _ in others]
     # r = p - Σ c_i p_i with c_i = Π_j t_j / (t_j - t_i), whose variance is (1 + Σ c_i²) σ²
-    parts = [math.prod(t / (t - own) for t in times_s if t != own) for own in times_s]
+    parts = [math.prod(t / (t - own) for t in times_ns if t != own) for own in times_ns]
     columns = zip(middle_m, *(place for _, place in others), strict=True)
     away_m = [m - sum(map(math.prod, zip(parts, places, strict=True))) for m, *places in columns]
     return math.hypot(*away_m) / math.sqrt(1.0 + sum(part * part for part in parts))
