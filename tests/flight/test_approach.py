@@ -80,6 +80,15 @@ def test_a_steady_wind_is_no_deceleration(axis: int, side: float) -> None:
     assert is_found(axis, side, asked_mps2=1.0, push_mps2=1.0)
 
 
+@pytest.mark.parametrize(("axis", "side"), LIMITS)
+def test_a_push_that_has_lasted_is_no_wind_where_it_gains_speed(axis: int, side: float) -> None:
+    """A mirrored response leaves -2 u unexplained: after seconds of it nothing seems to be asked for."""
+    for got_mps2, found in ((-0.3, False), (-0.3 - 1e-9, True)):
+        assert is_found(axis, side, asked_mps2=-1.0, push_mps2=2.0, got_mps2=got_mps2) == found
+    assert not is_found(axis, side, asked_mps2=0.4, push_mps2=0.0, got_mps2=-1.0)
+    assert is_found(axis, side, asked_mps2=2.0, push_mps2=-2.0, got_mps2=-1.0)
+
+
 @pytest.mark.parametrize(
     ("inside", "beyond"),
     [

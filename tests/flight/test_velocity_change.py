@@ -385,6 +385,8 @@ def test_a_sample_without_inertial_data_is_not_compared_with_those_before() -> N
         (0.0, just_more(0.25), True),
         (0.25 + 0.375, 0.0, False),  # leaps within 62.5 ms
         (just_more(0.25 + 0.375), 0.0, True),
+        (-0.75, 0.5, False),  # a response that is turned by 180°
+        (-0.75 - 1e-12, 0.5, True),
     ],
 )
 def test_a_velocity_may_repeat_and_leap_up_to_a_bound(own_mps: float, model_mps: float, is_wrong: bool) -> None:

@@ -3,7 +3,8 @@
 1. Over the last second the changes of the own velocity and of the velocity that setpoints give are known
    (`uavctl.flight.monitors.velocity_change`). A steady wind is taken off: the mean of what setpoints left unexplained.
 2. The vehicle is within two seconds of a limit, or beyond it. Setpoints ask for a deceleration of 0.5 m/s² or more, and
-   less than a quarter of it comes, for 0.1 s. Then: end the plans. The vehicle's own landing brakes without setpoints.
+   less than a quarter of it comes, for 0.1 s; or, wind or not, the vehicle gains 0.3 m/s² towards the limit.
+   Then: end the plans. The vehicle's own landing brakes without setpoints.
 
 A response that is dead and a wind that sets in look alike where setpoints change little: the monitor of the response
 cannot tell them. Before a limit it does not matter which of both it is.
@@ -29,6 +30,7 @@ SPAN_NS = 700_000_000  # least time between two velocities that are compared: th
 LEFT_S = 2.0  # time to the limit at the present speed: a vehicle at 1.5 m/s needs 1.2 s of it for its own landing
 LEAST_MPS = 0.1  # least speed: hovering in gusts makes less
 ASKED_MPS2, PART = 0.5, 0.25  # deceleration that is asked for, and the part of it that comes from a right response
+GAINS_MPS2 = 0.3  # acceleration towards the limit that a steady wind does not make
 PERSISTS_NS = 100_000_000
 
 
@@ -72,8 +74,11 @@ def _describe_approach(observation: TickObservation, change: VelocityChangeState
         if approach.speed_mps < LEAST_MPS or approach.distance_m > LEFT_S * approach.speed_mps:
             continue
         axis, outward = approach.axis, math.copysign(1.0, last[1][approach.axis])
-        asked_mps2 = -outward * ((last[3][axis] - first[3][axis]) / s + response.baseline[1 + axis] / count)
+        sent_mps2 = -outward * (last[3][axis] - first[3][axis]) / s
+        asked_mps2 = sent_mps2 - outward * response.baseline[1 + axis] / count
         got_mps2 = -outward * (last[1][axis] - first[1][axis]) / s
+        if got_mps2 < -GAINS_MPS2:  # a response that was mirrored for seconds looks like a wind that has blown before
+            asked_mps2 = max(asked_mps2, sent_mps2)
         if asked_mps2 >= ASKED_MPS2 and got_mps2 < PART * asked_mps2:
             return (
                 f"setpoints ask for {asked_mps2:.1f} m/s² before the {approach.limit} limit, and the vehicle brakes by "

@@ -39,7 +39,7 @@ INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degre
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 LEAST_S = 0.5  # over less, setpoints alone say nothing of an own velocity
 RECENT_NS = 300_000_000  # an agreement counts for so long
-# Leap from one message to the next: a disagreement, and what a turned response makes of the largest setpoints. Where
+# Leap from one message to the next: a disagreement, and what a turned response makes of usual setpoints. Where
 # inertial data were found wrong, nothing else checks the own velocity. Flights without a lie, recorded ones of real
 # autopilots included, stayed 0.2 m/s below the second bound.
 LEAP_MPS2, LONE_LEAP_MPS2 = 6.0, 3.0
@@ -165,13 +165,16 @@ def _judge_alone(
     if state.repeated is None:
         return replace(state, repeated=shown)
     (own, model, own_ns), (before, model_before, before_ns) = shown, state.repeated
-    # Repeats: |Δm| > v_max; leaps: |Δv - Δm| > v_max + 6 m/s² Δt, or 3 m/s² Δt
+    # Repeats: |Δm| > v_max; leaps: |Δv - Δm| > v_max + max(6 m/s² Δt, 2 |Δm|), or v_max + 3 m/s² Δt
     if own == before:
         is_wrong = math.dist(model, model_before) > parameters.disagreement_mps
     else:
         off_mps = math.dist(_subtract(own, before), _subtract(model, model_before))
-        leap_mps2 = LEAP_MPS2 if state.inertial_wrong_ns is None else LONE_LEAP_MPS2
-        is_wrong = off_mps > parameters.disagreement_mps + leap_mps2 * (own_ns - before_ns) * 1e-9
+        s = (own_ns - before_ns) * 1e-9
+        # A response that is turned makes up to 2 |Δm|.
+        turned_mps = max(LEAP_MPS2 * s, 2.0 * math.dist(model, model_before))
+        leap_mps = turned_mps if state.inertial_wrong_ns is None else LONE_LEAP_MPS2 * s
+        is_wrong = off_mps > parameters.disagreement_mps + leap_mps
         state = replace(state, repeated=shown)
     if not is_wrong or state.velocity_wrong_ns is not None:
         return state
