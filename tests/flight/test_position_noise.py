@@ -53,9 +53,8 @@ def test_few_positions_may_have_shown_too_little_noise(count: int, factor: float
     offsets = np.zeros((count, 3))
     offsets[::2, 0] = 0.03
     track = measure_noise(offsets)
-    assert track.std_m == pytest.approx(factor * 0.0159, rel=0.01) and track.is_known == track.is_measured == (
-        count > 4
-    )
+    assert track.std_m == pytest.approx(factor * 0.0159, rel=0.01)
+    assert track.is_known == track.is_measured == (count > 4)
     assert measure_noise(offsets[:2]).std_m == measure_noise(0.6 * offsets).std_m == 0.0
 
 

@@ -186,7 +186,7 @@ def test_nothing_is_compared_while_positions_correct_the_velocity() -> None:
 
 @pytest.mark.parametrize("are_compared", [True, False])
 def test_a_disagreement_is_decided_when_positions_come_back(*, are_compared: bool) -> None:
-    """Without it, an own velocity that lies since the last message would be believed against what comes back."""
+    """Without it, an own velocity that is wrong since the last message would be believed against positions."""
     samples = (
         (START_NS - 2 * TICK_NS, ZERO, ZERO, ZERO),
         (START_NS - TICK_NS, ZERO, north(9.0), ZERO),

@@ -195,6 +195,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
     adapts = for_flight and config.risk.budgets != "configured"
+    bounds_slack = not (adapts and config.risk.adapt and config.risk.from_first_position)
     solver = ConditionedSolver(
         problem,
         link,
@@ -203,10 +204,11 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         cov=cov,
         filter_plant=estimator_plant,
         has_lower_levels=adapts,
-        bounds_slack=not (adapts and config.risk.adapt and config.risk.from_first_position),
+        bounds_slack=bounds_slack,
         bounds_widening=config.risk.from_first_position,
     )
-    return ConditionedDesign(solver, cov, make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))
+    design_id = make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant, bounds_slack=bounds_slack)
+    return ConditionedDesign(solver, cov, design_id)
 
 
 def _build_planned_inputs(config: Config) -> Polytope:

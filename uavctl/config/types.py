@@ -348,9 +348,9 @@ class RiskConfig(Section, frozen=True, kw_only=True):
         bool,
         Meta(
             description="count the ages of positions from the first one on, also before the flight; adapt slowly where "
-            "no limit is near, leave half of the room between opposite limits, and while one axis leads plan with the "
-            "configured budgets; `false`, as in recordings of before: from the flight on, quickly everywhere, without "
-            "these bounds"
+            "no limit is near, leave half of the room between opposite limits, let slack decide no place of rest, and "
+            "while one axis leads plan with the configured budgets; `false`, as in recordings of before: from the "
+            "flight on, quickly everywhere, without these bounds"
         ),
     ] = True
 

@@ -50,7 +50,7 @@ def update(
         response: State of the monitor that keeps what setpoints leave unexplained, after this tick.
     """
     tick, parameters = observation.tick, observation.parameters
-    text = _describe_approach(observation, change, response)
+    text = _describe_failure(observation, change, response)
     if not text:
         return ApproachState(), NO_VERDICT
     since_ns = tick.at_ns if state.since_ns is None else state.since_ns
@@ -59,7 +59,7 @@ def update(
     return ApproachState(since_ns), end_plans(EventCode.SETPOINT_RESPONSE, text + describe_overrun(tick, parameters))
 
 
-def _describe_approach(observation: TickObservation, change: VelocityChangeState, response: ResponseState) -> str:
+def _describe_failure(observation: TickObservation, change: VelocityChangeState, response: ResponseState) -> str:
     """Return in words the limit before which setpoints do not slow the vehicle down; empty if none."""
     count = response.baseline[0]
     if change.velocity_wrong_ns is not None or not change.samples or not count:

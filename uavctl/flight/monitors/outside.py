@@ -107,7 +107,7 @@ def _describe_outside(observation: Observation, parameters: EnvelopeParameters, 
             stop_m = outward * REACTION_S + outward * outward / (2.0 * brake)
             is_beyond = out_m > margin and outward > -RETURNS_MPS
             if is_beyond or (brakes and outward > 0.0 and out_m + stop_m > margin):
-                return f"the estimate is {_describe_approach(out_m, limit, outward)}"
+                return f"the estimate is {_describe_limit(out_m, limit, outward)}"
     return None
 
 
@@ -158,11 +158,11 @@ def describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
         # All axes come to rest together: t = max(v_axis / a_axis, |v| / a); x < v_axis (T + t / 2)
         stop_s = max(approach.speed_mps / approach.brake_mps2, speed_mps / LANDING_MPS2)
         if approach.distance_m < approach.speed_mps * (REACTION_S + stop_s / 2.0):
-            text += f"; {_describe_approach(-approach.distance_m, approach.limit, approach.speed_mps)}"
+            text += f"; {_describe_limit(-approach.distance_m, approach.limit, approach.speed_mps)}"
     return text
 
 
-def _describe_approach(out_m: float, limit: str, outward_mps: float) -> str:
+def _describe_limit(out_m: float, limit: str, outward_mps: float) -> str:
     """Return how far beyond a limit the vehicle is, and that it could not stop where it flies outward."""
     place = f"{out_m:.1f} m beyond the {limit} limit" if out_m > 0.0 else f"{-out_m:.1f} m before the {limit} limit"
     return f"{place} at {outward_mps:.1f} m/s, it could not stop in time" if outward_mps > STANDS_MPS else place

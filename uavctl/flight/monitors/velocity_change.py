@@ -165,7 +165,7 @@ def _judge_alone(
     if state.repeated is None:
         return replace(state, repeated=shown)
     (own, model, own_ns), (before, model_before, before_ns) = shown, state.repeated
-    # Repeats: |Δm| > v_max; leaps: |Δv - Δm| > v_max + max(6 m/s² Δt, 2 |Δm|), or v_max + 3 m/s² Δt
+    # It repeats: |Δm| > v_max; it leaps: |Δv - Δm| > v_max + max(6 m/s² Δt, 2 |Δm|), or v_max + 3 m/s² Δt
     if own == before:
         is_wrong = math.dist(model, model_before) > parameters.disagreement_mps
     else:

@@ -42,7 +42,6 @@ from uavctl.smpc.sets import find_pairs
 AGE_EXPONENT = 1.0  # h of π_t^h, the weight of an age's back-off: its share of time. A larger h favours frequent ages
 MAX_RISK = 0.5  # largest risk of a row: with more, the mean would be outside of its limit
 MIN_RISK = 1e-9  # least remainder of the allowed risk, as a share of it: a smaller one is rounding
-TINY = 1e-300  # least divisor
 MAX_VARIANCE = 1e12  # largest variance along a row: a program takes a back-off of 1e30 for no limit
 ROUNDING = 1e-9  # largest rounding of a variance, as a share of the largest entry of its covariance
 RARE_SHARE = 0.05  # share of the allowed risk that the oldest ages, without back-offs, may use in transit
@@ -196,7 +195,7 @@ def bound_widening(sigma: Array, plain: Array, quantiles: Array, b: Array, oppos
     is_beyond = widened > most
     if not np.count_nonzero(is_beyond):
         return sigma
-    scale = np.where(is_beyond, most / np.maximum(widened, TINY), 1.0)
+    scale = np.divide(most, widened, out=np.ones_like(widened), where=is_beyond)
     bounded = sigma.copy()
     bounded[:, first] *= scale
     bounded[:, second] *= scale
@@ -360,7 +359,7 @@ def compute_reference_backoffs(
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states, the plant's before biases of its inputs; None: `problem.plant`.
             A new estimate of a bias changes no plan, because inputs include the bias.
-        bounds_slack: Whether new plans may seldom need slack. At a wall that costs 3 % with 30 % losses and 14 % with
+        bounds_slack: Whether new plans may seldom need slack. At a wall that costs 3 % with 30 % losses and 8 % with
             60 %; what slack adds to the risk is found by the loop on the observed risk.
     """
     rows = _make_reference_rows(problem, risk, slew, c, cov, problem.plant if filter_plant is None else filter_plant)

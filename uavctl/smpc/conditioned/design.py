@@ -65,11 +65,23 @@ AnyDesign: TypeAlias = "Design | ConditionedDesign"  # design of either scheme
 
 
 def make_conditioned_id(
-    problem: ControlProblem, link: AgeModel, allowed: float, slew_mps3: float, cov: Array, filter_plant: Plant | None
+    problem: ControlProblem,
+    link: AgeModel,
+    allowed: float,
+    slew_mps3: float,
+    cov: Array,
+    filter_plant: Plant | None,
+    *,
+    bounds_slack: bool,
 ) -> str:
-    """Return the hash of the arguments of `ConditionedSolver`, without the target."""
+    """Return the hash of the arguments of `ConditionedSolver` that its answers depend on, without the target.
+
+    An answer depends on its level and widening, too, which are part of each question.
+    """
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
-    return digest((METHOD, anywhere, link, allowed, slew_mps3, cov, filter_plant))
+    parts = METHOD, anywhere, link, allowed, slew_mps3, cov, filter_plant
+    # Recordings of before have the hash without the flag, and the bound.
+    return digest(parts if bounds_slack else (*parts, "slack is not bounded"))
 
 
 def make_conditioned_record(design: ConditionedDesign) -> dict[str, object]:
