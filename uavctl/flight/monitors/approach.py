@@ -10,7 +10,7 @@ A response that is dead and a wind that sets in look alike where setpoints chang
 cannot tell them. Before a limit it does not matter which of both it is.
 
 False alarms: 0 of 470 healthy flights in gusts of 3 and 8 m/s, with noise of 5 cm, blackouts and take-offs; 0 of 48
-slow approaches to walls, and hovers before them, in steady wind of 1 to 3 m/s with gusts; 2 of 25 flights whose mass was
+slow approaches to walls, and hovers before them, in steady wind of 1 to 3 m/s; 2 of 25 flights whose mass was
 off by 5 to 15 % from the first tick on (they sank).
 """
 
