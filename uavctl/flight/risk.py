@@ -10,7 +10,9 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 
+from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.estimator import select_covariance
@@ -65,15 +67,47 @@ def update_risk(
     if not is_flown and before >= context.controller.horizon:
         return RiskGroup(risk.renewed, risk.loop, age_steps, first_ns, risk.renewed), None
     age = before + 1
-    ages = count_age(risk.ages, age, parameters.choice)
-    renewed = ages if age_steps <= before else risk.renewed
     if not is_flown:
+        ages = count_age(risk.ages, age, parameters.choice)
+        renewed = ages if age_steps <= before else risk.renewed
         return RiskGroup(ages, risk.loop, age_steps, first_ns, renewed), _make_record(age, None, ages, risk.loop)
+    margins, variances = _find_margins(context, supervised, parameters, mission)
+    charged, outside = charge_step(
+        RiskGroup(risk.ages, risk.loop, before, first_ns, risk.renewed),
+        age_steps,
+        parameters,
+        margins,
+        variances,
+        horizon=context.controller.horizon,
+        keeps_away=plan is not None and plan.offset > 0.0,
+    )
+    return charged, _make_record(age, outside, charged.ages, charged.loop)
+
+
+def charge_step(
+    risk: RiskGroup,
+    age_steps: int,
+    parameters: RiskParameters,
+    margins: Array,
+    variances: Array,
+    *,
+    horizon: int,
+    keeps_away: bool,
+) -> tuple[RiskGroup, float]:
+    """Count and charge a step that was flown; return the risk after it, and the probability that it was outside.
+
+    Args:
+        age_steps: Age of the newest position at the end of the step.
+        margins: m = b - C x̂ of the mean there (m,).
+        variances: σ² = diag(C P C') (m,).
+        keeps_away: Whether the plan that moved the vehicle keeps away from a limit.
+    """
+    assert risk.age_steps is not None, "no position came before"
+    age = risk.age_steps + 1
+    ages = count_age(risk.ages, age, parameters.choice)
     # Behind the horizon no plan keeps f times the deviation: with f there, a long silence would raise f without end.
-    is_behind_horizon = age_steps >= context.controller.horizon
-    widening = 1.0 if is_behind_horizon else risk.loop.widening
-    outside = _find_outside_risk(widening, context, supervised, parameters, mission)
-    keeps_away = plan is not None and plan.offset > 0.0
+    is_behind_horizon = age_steps >= horizon
+    outside = compute_outside_risk(margins, variances, 1.0 if is_behind_horizon else risk.loop.widening)
     loop = charge_risk(
         risk.loop,
         outside,
@@ -82,7 +116,8 @@ def update_risk(
         is_behind_horizon=is_behind_horizon,
         begins_anywhere=not parameters.from_first_position,
     )
-    return RiskGroup(ages, loop, age_steps, first_ns, renewed), _make_record(age, outside, ages, loop)
+    renewed = ages if age_steps <= risk.age_steps else risk.renewed
+    return RiskGroup(ages, loop, age_steps, risk.first_ns, renewed), outside
 
 
 def _is_counted_before_flight(first_ns: int, context: TickContext, parameters: RiskParameters) -> bool:
@@ -114,19 +149,15 @@ def report_saturation(before: RiskGroup, now: RiskGroup, context: TickContext) -
     return (Event(at_ns=context.at_ns, severity=Severity.WARNING, code=EventCode.RISK_SATURATED, text=text),)
 
 
-def _find_outside_risk(
-    widening: float,
-    context: TickContext,
-    supervised: Supervised,
-    parameters: RiskParameters,
-    mission: MissionState | None,
-) -> float:
-    """Find the probability that the vehicle is outside of the limits of the moment."""
+def _find_margins(
+    context: TickContext, supervised: Supervised, parameters: RiskParameters, mission: MissionState | None
+) -> tuple[Array, Array]:
+    """Find the margins of the estimate to the limits of the moment, and the rows' variances (m,)."""
     belief, kalman, rows = supervised.view.belief, context.controller.kalman, parameters.rows
     if belief is None:
-        return 0.0
+        return np.full(len(rows), np.inf), np.zeros(len(rows))
     n_x = rows.shape[1]
     cov = select_covariance(kalman, belief)[:n_x, :n_x]
     # m = b - C x̂,  σ² = diag(C P C')
     margins = find_limits(context.controller.mission, mission, context.boundary_ns) - rows @ belief.mean[:n_x]
-    return compute_outside_risk(margins, ((rows @ cov) * rows).sum(axis=1), widening)
+    return margins, ((rows @ cov) * rows).sum(axis=1)

@@ -8,6 +8,7 @@ the configuration, with all that is random there:
    data, each step has one reading of them, with noise and a slow error, both as `estimator` assumes them.
 3. The flight's filter estimates state and biases. The flight's solver plans; a plan acts after the dead time.
 4. Where the position is as old as the horizon, the vehicle brakes by its predicted velocity.
+5. Each flight has its own risk: the ages are counted and the steps are charged as in flight.
 
 A flight that leaves the room is one trial. So the flights are independent, though the steps of a flight are not, and
 the bound of Clopper and Pearson (1934) is exact for the probability *in this world*. Its wind, link and vehicle are the
@@ -31,7 +32,9 @@ from uavctl.config import Config
 from uavctl.config.checks import get_position_limits_m
 from uavctl.flight.controller import Controller
 from uavctl.flight.kalman import Kalman, make_kalman, make_model
-from uavctl.flight.mission import MissionState, advance_mission, make_question
+from uavctl.flight.mission import MissionState, advance_mission, find_limits, make_question
+from uavctl.flight.risk import charge_step, set_risk
+from uavctl.flight.risk_state import RiskGroup
 from uavctl.lab.campaign.arrivals import compute_known_steps, select_newest_captures
 from uavctl.lab.campaign.draws import draw, draw_noise
 from uavctl.lab.campaign.position_filter import FilterBelief, PositionFilter
@@ -213,6 +216,7 @@ class _Pilot:
         self._brake = config.fallback.brake_gain_1ps
         self._input_of_accel = np.linalg.pinv(design.plant.accel_map)
         self._state: MissionState | None = None
+        self._parameters, self._risk, self._keeps_away = controller.risk, RiskGroup(age_steps=0), False
         self._plan, self._plan_step, self._capture = np.zeros((0, design.plant.n_u)), 0, -1
         self._sent = np.zeros(design.plant.n_u)
 
@@ -239,13 +243,38 @@ class _Pilot:
             self._plan, self._sent = self._plan[:0], braking - bias if bias.size else braking
         return self._sent
 
+    def charge(self, k: int, age_steps: int, mean: Array, cov: Array) -> None:
+        """Count and charge the step that ends at k; see `uavctl.flight.risk`.
+
+        Args:
+            mean: States there (n_x,).
+            cov: Their covariance (n_x, n_x).
+        """
+        if self._parameters is None:
+            return
+        rows = self._parameters.rows
+        # m = b - C x̂,  σ² = diag(C P C')
+        margins = find_limits(self._mission, self._state, k * self._dt_ns) - rows @ mean
+        variances = ((rows @ cov) * rows).sum(axis=1)
+        self._risk, _ = charge_step(
+            self._risk,
+            age_steps,
+            self._parameters,
+            margins,
+            variances,
+            horizon=self._design.horizon,
+            keeps_away=self._keeps_away and bool(len(self._plan)),
+        )
+
     def _replan(self, k: int, capture: int, x: Array, bias: Array, cov: Array) -> None:
         assert self._state is not None
         target, preview = make_question(self._mission, self._state, k * self._dt_ns)
         sent = self._sent + bias if bias.size else self._sent
         question = Preview(limits=preview.limits, path=preview.path, age=k - capture, cov=cov, sent=sent)
+        question = set_risk(question, self._risk, self._parameters, is_led=False)
         answer = self._design.solver.solve(k, x, target, question)
         if answer.status is SolveStatus.OPTIMAL:
+            self._keeps_away = answer.offset > 0.0
             # u_sent = u_plan - d
             self._plan = answer.inputs - bias if bias.size else answer.inputs
             self._plan_step, self._capture = k, capture
@@ -277,6 +306,9 @@ def _fly(
         measured_m = states[:, k, index] + draws.position_noise_m[:, k]
         flight_filter.update(k, measured_m, newest_captures[:, k], inputs[:, :k])
         mean, cov = flight_filter.now
+        for run, pilot in enumerate(pilots if k else ()):
+            age_steps = k - int(newest_captures[run, k])
+            pilot.charge(k, age_steps, mean[run, : plant.n_x], cov[run, : plant.n_x, : plant.n_x])
         for dead in range(dead_steps):
             mean, cov = flight_filter.predict(mean, cov, inputs[:, k + dead])
         cov = np.ascontiguousarray(cov[:, :n, :n])

@@ -70,7 +70,7 @@ def fly(
     world = World(excited, Followed())
     vehicle = world.peers.vehicle
     world.run(over_s, lambda: world.peers.autopilot.mode_name in ("AUTO.LAND", "LAND"))
-    assert isinstance(vehicle, TrueVehicle) and len(beyond) > 50
+    assert isinstance(vehicle, TrueVehicle) and len(beyond) > 40  # two seconds of flight
     assert max(beyond) < -LEFT_M
     return monitor
 
