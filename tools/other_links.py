@@ -22,9 +22,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from uavctl.arrays import Array
-from uavctl.smpc.answer import CERTIFICATE_LEVEL, Answer, Preview
-from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_level_choice
+from uavctl.smpc.answer import Answer, Preview
+from uavctl.smpc.conditioned.adaptation import (
+    AgeRecord,
+    LoopState,
+    SpreadState,
+    charge_risk,
+    compute_outside_risk,
+    count_age,
+    count_innovation,
+)
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import ControlProblem, propagate_covariance
 from uavctl.smpc.plant import Plant
@@ -146,7 +154,7 @@ def fly(
     adapts = budgets != "configured"
     problem, plant = solver.problem, solver.problem.plant
     covs = propagate_covariance(plant, steps)
-    choice, ages, loop = make_level_choice(solver, ALLOWED), AgeRecord(), LoopState()
+    choice, ages, loop = make_budget_choice(solver, ALLOWED), AgeRecord(), LoopState()
     arrived, noise = draw_run(cell, steps, problem, rng)
     if steps_before:
         silence = 0
@@ -156,12 +164,19 @@ def fly(
     rows, sides, target = problem.state_set.c, problem.state_set.b, problem.target
     x = target - np.array([2.0, 0.0] * plant.n_u)
     plan: Answer | None = None
+    spread = SpreadState()
     states, inputs, begun, newest, before = [x], np.zeros((steps, plant.n_u)), 0, 0, 0
     outside, cost = np.zeros(steps), np.zeros(steps)
     for k in range(steps):
         captured = k - cell.late
         is_new = k == 0 or (captured >= 0 and bool(arrived[captured]))
-        newest = max(newest, captured) if is_new else newest
+        if is_new and captured > newest:
+            mean = states[newest]
+            for step in range(newest, captured):
+                mean = plant.a @ mean + plant.b @ inputs[step]
+            variances = covs[captured - newest].diagonal()[::2]
+            spread = count_innovation(spread, (states[captured] - mean)[::2].tolist(), variances.tolist())
+            newest = captured
         age, mean = k - newest, states[newest]
         for step in range(newest, k):
             mean = plant.a @ mean + plant.b @ inputs[step]
@@ -169,18 +184,19 @@ def fly(
             ages = count_age(ages, before + 1, choice)
             variances = np.einsum("mi,ij,mj->m", rows, covs[age], rows)
             is_behind = age >= HORIZON
-            risk = compute_outside_risk(sides - rows @ mean, variances, 1.0 if is_behind else loop.widening)
+            risk = compute_outside_risk(sides - rows @ mean, variances, spread.spread)
             keeps_away = plan is not None and plan.offset > 0.0
             loop = charge_risk(loop, risk, ALLOWED, keeps_away=keeps_away, is_behind_horizon=is_behind)
         before = age
         if is_new and age < HORIZON:
             preview = Preview(age=age, cov=covs[age] if age else None)
             if adapts:
+                rank = ages.rank if budgets == "observed" else 0
                 preview = Preview(
                     age=age,
                     cov=preview.cov,
-                    level=ages.level if budgets == "observed" else CERTIFICATE_LEVEL,
-                    widening=loop.widening,
+                    level=choice.levels[rank],
+                    widening=round(choice.scales[rank] * loop.widening, 2),
                     silence_widening=loop.silence_widening,
                 )
             plan, begun = solver.solve(0, mean, target, preview), k

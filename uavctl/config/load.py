@@ -286,7 +286,6 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
         ("daemon", "radio_channels"): "false",
         ("relay", "vehicle_time"): "false",
         ("risk", "budgets"): '"configured"',
-        ("risk", "from_first_position"): "false",
         ("smpc", "scheme"): '"hahn-stursberg"',
     }
     missing = [

@@ -332,8 +332,8 @@ class RiskConfig(Section, frozen=True, kw_only=True):
         Literal["certificate", "observed", "configured"],
         Meta(
             description="risk of each age of information, with scheme `age-conditioned`: `observed` begins as "
-            "`certificate`, and gives more to rare ages as far as the link, from the first position on, agrees with "
-            "`[link]`; `certificate` holds on any link, further away from limits; `configured` holds on a link as in "
+            "`certificate`, and gives more to rare ages as far as the link shows, from the first position on, how rare "
+            "they are; `certificate` holds on any link, further away from limits; `configured` holds on a link as in "
             "`[link]` alone"
         ),
     ] = "observed"
@@ -342,15 +342,6 @@ class RiskConfig(Section, frozen=True, kw_only=True):
         Meta(
             description="keep further away from limits in flight while they are left more often than allowed, and "
             "nearer while less often, with `risk.budgets` `certificate` or `observed`"
-        ),
-    ] = True
-    from_first_position: Annotated[
-        bool,
-        Meta(
-            description="count the ages of positions from the first one on, also before the flight; adapt slowly where "
-            "no limit is near, leave half of the room between opposite limits, let slack decide no place of rest, and "
-            "while one axis leads plan with the configured budgets; `false`, as in recordings of before: from the "
-            "flight on, quickly everywhere, without these bounds"
         ),
     ] = True
 

@@ -83,7 +83,8 @@ def report_events(
     """Report what has changed in a tick."""
     before, at_ns = state.alarms, context.at_ns
     counts, link = _count_link(before.link, context, supervised)
-    risk, risk_record = update_risk(state.risk, context, supervised, state.mission.progress, state.plan.flown)
+    spread = measured.samples.sources.spread.spread
+    risk, risk_record = update_risk(state.risk, context, supervised, state.mission.progress, state.plan.flown, spread)
     if link is not None and risk_record is not None:
         link = msgspec.structs.replace(link, risk=risk_record)
     link_alarms = before.link_alarms if link is None else _find_link_alarms(link, before.link_alarms)

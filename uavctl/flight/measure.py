@@ -55,6 +55,7 @@ from uavctl.flight.monitors.outliers import OutlierObservation, OutlierTrack, Re
 from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.flight.state import ControlState, InertialReading, SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleStatus
+from uavctl.smpc.conditioned.adaptation import SpreadState, count_innovation
 
 # A plan bridges H steps. A sample is fresh up to an age of H divided by this: most of the steps are left to the plan.
 _FRESH_PART = 3
@@ -309,11 +310,26 @@ def _judge_sample(
         sources = replace(sources, velocity_error_mps=later_error_mps, outliers=outlier_track)
         if not sources.noise.is_known:
             return sources, NO_VERDICT
-        return _judge_jump(kalman, sources, offset, _correct_sample(sources, sample, at_ns), belief)
+        corrected = _correct_sample(sources, sample, at_ns)
+        if at_ns > (history.captured_ns or at_ns):
+            sources = replace(sources, spread=_count_innovation(kalman, sources.spread, corrected, belief))
+        return _judge_jump(kalman, sources, offset, corrected, belief)
     if frozen.is_repeat(tracks[sample.source], at_ns):
         # A repeated value did not jump: the prediction has moved away from a source that is frozen.
         return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN)
     return replace(sources, outliers=outlier_track), verdict
+
+
+def _count_innovation(kalman: Kalman, spread: SpreadState, corrected: PositionSample, belief: Belief) -> SpreadState:
+    """Count the innovation of a position for the spread."""
+    values, variances = read_measurement(kalman, corrected)
+    index = kalman.measured_index[: len(kalman.axes)]
+    # ν = y - H z,  s² = P + R
+    innovations, expected = (
+        values[: len(index)] - belief.mean[index],
+        belief.cov[index, index] + variances[: len(index)],
+    )
+    return count_innovation(spread, innovations.tolist(), expected.tolist())
 
 
 def _correct_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -> PositionSample:

@@ -4,7 +4,7 @@
    younger when the step began. Ages before the flight count too, as it is the same link: from SETTLING_NS after the
    first position on, and without silences that outlast the horizon, as of a source that is switched off.
 2. The risk of that state, given all that is known now, is charged while the controller flies.
-3. The next plan is made with the level and the spread that follow.
+3. The next plan is made with the level and the deviations that follow.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from uavctl.flight.mission import MissionState, find_limits
 from uavctl.flight.risk_state import RiskGroup, RiskParameters
 from uavctl.flight.supervise import Supervised
 from uavctl.records import Event, Plan, RiskRecord, Severity
-from uavctl.smpc.answer import CERTIFICATE_LEVEL, CONFIGURED_LEVEL, Preview
+from uavctl.smpc.answer import CONFIGURED_LEVEL, Preview
 from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
 
 # The first positions of a source do not show its clock yet: a few round trips take two seconds, and the smallest delay
@@ -29,7 +29,7 @@ SETTLING_NS = 2_000_000_000
 
 
 def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | None, *, is_led: bool) -> Preview:
-    """Set the level and the spread of a plan.
+    """Set the level of a plan, and the factors of its deviations.
 
     Args:
         is_led: Whether one horizontal axis leads. Beside a limit the budgets of a lower level move the other one as
@@ -37,24 +37,31 @@ def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | Non
     """
     if parameters is None:
         return preview
-    level = risk.ages.level if parameters.budgets == "observed" else CERTIFICATE_LEVEL
-    if is_led and parameters.from_first_position:
-        level = CONFIGURED_LEVEL
+    level, scale = CONFIGURED_LEVEL, 1.0
+    if not is_led:
+        rank = risk.ages.rank if parameters.budgets == "observed" else 0
+        level, scale = parameters.choice.levels[rank], parameters.choice.scales[rank]
     if not parameters.adapts:
-        return msgspec.structs.replace(preview, level=level)
-    return msgspec.structs.replace(
-        preview, level=level, widening=risk.loop.widening, silence_widening=risk.loop.silence_widening
-    )
+        return msgspec.structs.replace(preview, level=level, widening=scale)
+    # Rounded: plans of one value share their preparation.
+    widening = round(scale * risk.loop.widening, 2)
+    return msgspec.structs.replace(preview, level=level, widening=widening, silence_widening=risk.loop.silence_widening)
 
 
 def update_risk(
-    risk: RiskGroup, context: TickContext, supervised: Supervised, mission: MissionState | None, plan: Plan | None
+    risk: RiskGroup,
+    context: TickContext,
+    supervised: Supervised,
+    mission: MissionState | None,
+    plan: Plan | None,
+    spread: float,
 ) -> tuple[RiskGroup, RiskRecord | None]:
     """Count and charge the step that ends at a boundary; return the record of it.
 
     Args:
         mission: State of the mission, for the limits of the moment.
         plan: Plan that moved the vehicle here; None if there was none.
+        spread: v, by which disturbances differ from the model's.
     """
     parameters, age_steps = context.controller.risk, supervised.view.age_steps
     if parameters is None or not context.is_boundary or context.at_ns != context.boundary_ns or age_steps is None:
@@ -62,7 +69,7 @@ def update_risk(
     before = risk.age_steps
     is_flown = context.was_in_control and context.is_controllable
     first_ns = context.at_ns if risk.first_ns is None else risk.first_ns
-    if before is None or not (is_flown or _is_counted_before_flight(first_ns, context, parameters)):
+    if before is None or not (is_flown or _is_counted_before_flight(first_ns, context)):
         return RiskGroup(risk.ages, risk.loop, age_steps, first_ns, risk.renewed), None
     if not is_flown and before >= context.controller.horizon:
         return RiskGroup(risk.renewed, risk.loop, age_steps, first_ns, risk.renewed), None
@@ -70,7 +77,9 @@ def update_risk(
     if not is_flown:
         ages = count_age(risk.ages, age, parameters.choice)
         renewed = ages if age_steps <= before else risk.renewed
-        return RiskGroup(ages, risk.loop, age_steps, first_ns, renewed), _make_record(age, None, ages, risk.loop)
+        return RiskGroup(ages, risk.loop, age_steps, first_ns, renewed), _make_record(
+            age, None, ages, risk.loop, parameters, spread
+        )
     margins, variances = _find_margins(context, supervised, parameters, mission)
     charged, outside = charge_step(
         RiskGroup(risk.ages, risk.loop, before, first_ns, risk.renewed),
@@ -78,10 +87,11 @@ def update_risk(
         parameters,
         margins,
         variances,
+        spread,
         horizon=context.controller.horizon,
         keeps_away=plan is not None and plan.offset > 0.0,
     )
-    return charged, _make_record(age, outside, charged.ages, charged.loop)
+    return charged, _make_record(age, outside, charged.ages, charged.loop, parameters, spread)
 
 
 def charge_step(
@@ -90,6 +100,7 @@ def charge_step(
     parameters: RiskParameters,
     margins: Array,
     variances: Array,
+    spread: float,
     *,
     horizon: int,
     keeps_away: bool,
@@ -100,38 +111,36 @@ def charge_step(
         age_steps: Age of the newest position at the end of the step.
         margins: m = b - C x̂ of the mean there (m,).
         variances: σ² = diag(C P C') (m,).
+        spread: v, by which disturbances differ from the model's.
         keeps_away: Whether the plan that moved the vehicle keeps away from a limit.
     """
     assert risk.age_steps is not None, "no position came before"
     age = risk.age_steps + 1
     ages = count_age(risk.ages, age, parameters.choice)
-    # Behind the horizon no plan keeps f times the deviation: with f there, a long silence would raise f without end.
-    is_behind_horizon = age_steps >= horizon
-    outside = compute_outside_risk(margins, variances, 1.0 if is_behind_horizon else risk.loop.widening)
+    outside = compute_outside_risk(margins, variances, spread)
     loop = charge_risk(
-        risk.loop,
-        outside,
-        parameters.choice.allowed,
-        keeps_away=keeps_away,
-        is_behind_horizon=is_behind_horizon,
-        begins_anywhere=not parameters.from_first_position,
+        risk.loop, outside, parameters.choice.allowed, keeps_away=keeps_away, is_behind_horizon=age_steps >= horizon
     )
     renewed = ages if age_steps <= risk.age_steps else risk.renewed
     return RiskGroup(ages, loop, age_steps, risk.first_ns, renewed), outside
 
 
-def _is_counted_before_flight(first_ns: int, context: TickContext, parameters: RiskParameters) -> bool:
+def _is_counted_before_flight(first_ns: int, context: TickContext) -> bool:
     """Return whether a step counts in which the controller does not fly."""
-    return parameters.from_first_position and context.at_ns - first_ns >= SETTLING_NS
+    return context.at_ns - first_ns >= SETTLING_NS
 
 
-def _make_record(age: int, outside: float | None, ages: AgeRecord, loop: LoopState) -> RiskRecord:
+def _make_record(
+    age: int, outside: float | None, ages: AgeRecord, loop: LoopState, parameters: RiskParameters, spread: float
+) -> RiskRecord:
     """Make the record of a step."""
     return RiskRecord(
         age=age,
-        level=ages.level,
+        level=parameters.choice.levels[ages.rank],
+        scale=parameters.choice.scales[ages.rank],
         contradicts=ages.contradicts,
         outside=outside,
+        spread=spread,
         widening=loop.widening,
         silence_widening=loop.silence_widening,
     )

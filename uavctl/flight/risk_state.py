@@ -7,19 +7,17 @@ from dataclasses import dataclass
 import msgspec
 
 from uavctl.arrays import Array
-from uavctl.smpc.conditioned.adaptation import AgeRecord, LevelChoice, LoopState
+from uavctl.smpc.conditioned.adaptation import AgeRecord, BudgetChoice, LoopState
 
 
 @dataclass(frozen=True, eq=False)
 class RiskParameters:
     """Parameters of the risk in flight."""
 
-    choice: LevelChoice  # what the level is chosen by
+    choice: BudgetChoice  # budgets to choose from
     rows: Array  # state rows C (m, n_x)
-    budgets: str  # `certificate`, or `observed`: the level follows the link
+    budgets: str  # `certificate`, or `observed`: they follow the link
     adapts: bool  # whether the spread follows the risk as observed
-    # Whether the ages before the flight count, and the loop begins slowly far from limits; not in recordings of before
-    from_first_position: bool
 
 
 class RiskGroup(msgspec.Struct, frozen=True):

@@ -20,6 +20,7 @@ from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.flight.risk_state import RiskGroup
 from uavctl.records import Command, ControlMode, Plan, Vec3
+from uavctl.smpc.conditioned.adaptation import SpreadState
 
 
 class SourceHealth(msgspec.Struct, frozen=True, eq=False):
@@ -33,6 +34,7 @@ class SourceHealth(msgspec.Struct, frozen=True, eq=False):
     tracks: SourceTracks = msgspec.field(default_factory=dict)  # what each source has shown
     noise: NoiseTrack = NoiseTrack()  # noise of positions that were believed
     jumps: JumpTrack = JumpTrack()  # jumps between two solutions
+    spread: SpreadState = SpreadState()  # how far positions are from their predictions
     last_motion_ns: LastMotionNs = (0, 0, 0)  # when the vehicle last moved, each axis, by its own velocity
 
 

@@ -262,6 +262,7 @@ class _Pilot:
             self._parameters,
             margins,
             variances,
+            spread=1.0,  # disturbances are those of the model
             horizon=self._design.horizon,
             keeps_away=self._keeps_away and bool(len(self._plan)),
         )

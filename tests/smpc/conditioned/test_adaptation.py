@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from uavctl.arrays import Array
 from uavctl.build.controller import build_problem
 from uavctl.config.load import load_config
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned import adaptation
-from uavctl.smpc.conditioned.adaptation import AgeRecord, LevelChoice, LoopState, charge_risk, count_age
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_level_choice
+from uavctl.smpc.conditioned.adaptation import AgeRecord, BudgetChoice, LoopState, charge_risk, count_age
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
 from uavctl.smpc.link import bernoulli
 
 ALLOWED = 0.05
@@ -29,8 +30,8 @@ def solver() -> ConditionedSolver:
 
 
 @pytest.fixture(scope="module")
-def choice(solver: ConditionedSolver) -> LevelChoice:
-    return make_level_choice(solver, ALLOWED)
+def choice(solver: ConditionedSolver) -> BudgetChoice:
+    return make_budget_choice(solver, ALLOWED)
 
 
 def draw_ages(steps: int, loss: float, burst: float, seed: int) -> list[int]:
@@ -45,25 +46,48 @@ def draw_ages(steps: int, loss: float, burst: float, seed: int) -> list[int]:
     return ages
 
 
-def record_ages(ages: list[int], choice: LevelChoice, record: AgeRecord | None = None) -> AgeRecord:
+def record_ages(ages: list[int], choice: BudgetChoice, record: AgeRecord | None = None) -> AgeRecord:
     record = record or AgeRecord()
     for age in ages:
         record = count_age(record, age, choice)
     return record
 
 
-def test_the_certificate_keeps_the_allowed_risk_on_any_link(choice: LevelChoice) -> None:
+def test_the_certificate_keeps_the_allowed_risk_on_any_link(choice: BudgetChoice) -> None:
     for shares in np.random.default_rng(0).dirichlet(np.full(len(choice.shares), 0.3), 50):
         assert shares @ choice.budgets[0] <= ALLOWED + 1e-12
 
 
-def test_each_level_keeps_the_allowed_risk_on_the_configured_link(choice: LevelChoice) -> None:
-    assert choice.budgets @ choice.shares == pytest.approx(ALLOWED, rel=1e-6)
+def test_each_level_keeps_the_allowed_risk_on_the_configured_link(
+    solver: ConditionedSolver, choice: BudgetChoice
+) -> None:
+    for level in solver.levels:
+        spent = level.near.risk.budgets @ choice.shares[:-1]
+        assert spent <= ALLOWED * (1.0 + 1e-9)
+        assert spent == pytest.approx(ALLOWED - choice.shares[-1], rel=1e-3)
+    unscaled = [rank for rank, scale in enumerate(choice.scales) if scale == 1.0]
+    assert [choice.levels[rank] for rank in unscaled] == [0, 1, 2]
+    assert choice.budgets[unscaled] @ choice.shares == pytest.approx(ALLOWED, rel=1e-3)
 
 
-def test_higher_levels_give_old_information_more_and_cost_less(solver: ConditionedSolver, choice: LevelChoice) -> None:
-    oldest = choice.budgets[:, -2]
+def test_scaled_budgets_are_the_risk_of_rows_with_scaled_back_offs(choice: BudgetChoice) -> None:
+    """However rows share a budget, they keep no more of it than one row alone."""
+    rng = np.random.default_rng(1)
+    for budget, scale in zip(rng.uniform(0.001, 0.5, 200), rng.uniform(1.0, 2.2, 200), strict=True):
+        (left,) = adaptation.scale_budgets(np.array([budget]), scale)
+        assert left == pytest.approx(norm.sf(scale * norm.isf(budget)), rel=1e-9)
+        shares = rng.dirichlet(np.ones(3)) * budget
+        assert norm.sf(scale * norm.isf(shares)).sum() <= left * (1.0 + 1e-9)
+    assert adaptation.scale_budgets(np.array([0.7, 1.0]), 2.0).tolist() == [0.7, 1.0]
+
+
+def test_higher_levels_give_old_information_more_and_cost_less(solver: ConditionedSolver, choice: BudgetChoice) -> None:
+    oldest = np.array([level.near.risk.budgets[-1] for level in solver.levels])
     assert (np.diff(oldest) > 0.0).all()
+    for level in (1, 2):
+        ranks = [rank for rank, own in enumerate(choice.levels) if own == level]
+        assert (np.diff(choice.budgets[ranks, -2]) > 0.0).all()
+        assert (np.diff([choice.scales[rank] for rank in ranks]) < 0.0).all()
     state = np.array([0.0, 0.0, 17.0, 0.0])
     target = solver.problem.target
     costs = [solver.solve(0, state, target, Preview(level=level)).cost for level in range(len(solver.levels))]
@@ -76,31 +100,32 @@ def test_without_a_level_a_plan_is_that_of_the_configured_link(solver: Condition
     assert plain.solve(0, state, target).inputs.tobytes() == solver.solve(0, state, target).inputs.tobytes()
 
 
-def test_no_data_are_the_certificate_and_a_long_matching_record_is_the_configured_link(choice: LevelChoice) -> None:
-    assert AgeRecord().level == 0
-    assert record_ages(draw_ages(30, LOSS, 1.0, 1), choice).level == 0
-    assert record_ages(draw_ages(3000, LOSS, 1.0, 1), choice).level == len(choice.budgets) - 1
+def test_no_data_are_the_certificate_and_a_long_matching_record_gives_most(choice: BudgetChoice) -> None:
+    assert AgeRecord().rank == 0
+    assert record_ages(draw_ages(20, LOSS, 1.0, 1), choice).rank < len(choice.budgets) - 1
+    assert record_ages(draw_ages(3000, LOSS, 1.0, 1), choice).rank == len(choice.budgets) - 1
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.3, 3.0), (0.3, 10.0), (0.6, 1.0), (0.8, 10.0)])
-def test_a_link_that_differs_keeps_the_allowed_risk(choice: LevelChoice, loss: float, burst: float) -> None:
+def test_a_link_that_differs_keeps_the_allowed_risk(choice: BudgetChoice, loss: float, burst: float) -> None:
     ages = draw_ages(40_000, loss, burst, 2)
     shares = np.bincount(np.minimum(ages, len(choice.shares)) - 1, minlength=len(choice.shares)) / len(ages)
     for seed in range(5):
-        level = record_ages(draw_ages(1000, loss, burst, seed), choice).level
-        assert shares @ choice.budgets[level] <= ALLOWED * (1.0 + adaptation.END_TOLERANCE)
+        rank = record_ages(draw_ages(1000, loss, burst, seed), choice).rank
+        assert shares @ choice.budgets[rank] <= ALLOWED * (1.0 + adaptation.END_TOLERANCE)
+        assert rank > 0
 
 
-def test_a_link_that_changes_takes_the_level_back(choice: LevelChoice) -> None:
+def test_a_link_that_changes_takes_the_budgets_back(choice: BudgetChoice) -> None:
     record = record_ages(draw_ages(3000, LOSS, 1.0, 3), choice)
-    assert record.level > 0
+    assert record.rank == len(choice.budgets) - 1
     record = record_ages(draw_ages(200, 0.6, 1.0, 3), choice, record)
     assert record.contradicts
-    assert record.level == 0
+    assert choice.scales[record.rank] > 1.2 or record.rank == 0
     assert not record_ages(draw_ages(3000, LOSS, 1.0, 4), choice, record).contradicts
 
 
-def test_bounds_hold_the_true_shares_as_often_as_they_state(choice: LevelChoice) -> None:
+def test_bounds_hold_the_true_shares_as_often_as_they_state(choice: BudgetChoice) -> None:
     """Each bound separately, without the configured link."""
     shares = choice.shares
     missed = np.zeros((2, 4))
@@ -157,19 +182,24 @@ def test_safe_steps_far_from_limits_lower_f_to_one_and_no_further() -> None:
     assert state.log_widening == 0.0
 
 
-def test_the_loop_begins_faster_beside_a_limit_only_and_everywhere_in_recordings_of_before() -> None:
+def test_the_loop_begins_faster_beside_a_limit_only() -> None:
     full = (1.0 / ALLOWED) - adaptation.TARGET
+    for keeps_away, gain in ((False, adaptation.GAIN), (True, 1.0 / adaptation.FIRST_STEPS)):
+        state = charge_risk(LoopState(), 1.0, ALLOWED, keeps_away=keeps_away, is_behind_horizon=False)
+        assert state.log_widening == pytest.approx(gain * full)
 
-    def charge(*, keeps_away: bool, begins_anywhere: bool) -> float:
-        state = charge_risk(
-            LoopState(), 1.0, ALLOWED, keeps_away=keeps_away, is_behind_horizon=False, begins_anywhere=begins_anywhere
-        )
-        return state.log_widening
 
-    assert charge(keeps_away=False, begins_anywhere=False) == pytest.approx(adaptation.GAIN * full)
-    for keeps_away, begins_anywhere in ((True, False), (True, True), (False, True)):
-        first = charge(keeps_away=keeps_away, begins_anywhere=begins_anywhere)
-        assert first == pytest.approx(full / adaptation.FIRST_STEPS)
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.5])
+def test_the_spread_follows_innovations_and_one_wrong_position_hardly_moves_it(factor: float) -> None:
+    rng, state = np.random.default_rng(4), adaptation.SpreadState()
+    assert state.spread == 1.0
+    for _ in range(2000):
+        variances = rng.choice([0.01, 0.09], size=3)
+        innovations = factor * np.sqrt(variances) * rng.standard_normal(3)
+        state = adaptation.count_innovation(state, innovations.tolist(), variances.tolist())
+    assert state.spread == pytest.approx(factor, rel=0.1)
+    after = adaptation.count_innovation(adaptation.SpreadState(1.0, 1.0), [1e6], [1.0])
+    assert after.spread**2 == pytest.approx(1.0 + 15.0 * adaptation.SPREAD_GAIN)
 
 
 def test_risk_in_a_silence_moves_the_end_of_plans_alone_and_is_forgotten_without_one() -> None:

@@ -11,7 +11,6 @@ from baseline_rig import problem
 from uavctl.build.controller import build_conditioned, build_controller, build_estimator, build_problem
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman, settle_covariance
-from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.backoffs import RowDeviations, bound_widening, find_opposite_rows
 from uavctl.smpc.estimate import add_bias, innovation_form
 from uavctl.smpc.nominal import find_parts
@@ -95,22 +94,3 @@ def test_widened_back_offs_leave_half_of_the_room_between_opposite_limits() -> N
             assert factors[0] >= 1.0 - 1e-12
         is_bounded.append(factors[0] < 3.9)
     assert any(is_bounded) and not all(is_bounded)
-
-
-def test_without_bounds_on_widening_a_plan_is_that_of_before() -> None:
-    """Recordings without the key replay so."""
-    observed = ["risk.budgets=observed"]
-    bounded, free = (
-        build_conditioned(load_config("room-px4", [*observed, f"risk.from_first_position={value}"])).solver
-        for value in ("true", "false")
-    )
-    target = bounded.problem.target
-    state = target + bounded.problem.plant.equilibrium((0.5, 0.0, 0.0))
-    slack = {}
-    for widening in (1.0, 4.0):
-        preview = Preview(level=0, widening=widening)
-        plans = [solver.solve(0, state, target, preview) for solver in (bounded, free)]
-        slack[widening] = [plan.slack for plan in plans]
-        assert (plans[0].inputs.tobytes() == plans[1].inputs.tobytes()) == (widening == 1.0)
-    # No plan is inside of limits whose back-offs cross.
-    assert slack[4.0][0] == 0.0 < slack[4.0][1]

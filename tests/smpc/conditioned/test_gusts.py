@@ -13,9 +13,17 @@ from uavctl.arrays import Array
 from uavctl.build.controller import build_problem
 from uavctl.config.load import load_config
 from uavctl.smpc.answer import Preview
-from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
+from uavctl.smpc.conditioned.adaptation import (
+    AgeRecord,
+    LoopState,
+    SpreadState,
+    charge_risk,
+    compute_outside_risk,
+    count_age,
+    count_innovation,
+)
 from uavctl.smpc.conditioned.backoffs import RowDeviations
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_level_choice
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import find_parts, propagate_covariance
 
@@ -50,20 +58,28 @@ def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapt
     covs, rows, sides = propagate_covariance(plant, STEPS), problem.state_set.c, problem.state_set.b
     arrived = rng.random(STEPS) >= LOSS
     disturbances = draw_disturbances(kind, STEPS, rng) @ np.linalg.cholesky(plant.w).T
-    choice, ages, loop = make_level_choice(solver, ALLOWED), AgeRecord(), LoopState()
+    choice, ages, loop = make_budget_choice(solver, ALLOWED), AgeRecord(), LoopState()
     x, mean, newest, outside = problem.target.copy(), problem.target.copy(), 0, np.zeros(STEPS)
-    plan = solver.solve(0, x, problem.target)
+    plan, spread, places = solver.solve(0, x, problem.target), SpreadState(), list(plant.position_index)
     for k in range(STEPS):
         if k:
-            before, newest = k - 1 - newest, k if arrived[k] else newest
-            age, mean = k - newest, x if arrived[k] else mean
+            before = k - 1 - newest
+            if arrived[k]:
+                expected = covs[k - newest].diagonal()[places]
+                spread = count_innovation(spread, (x - mean)[places].tolist(), expected.tolist())
+                newest, mean = k, x
+            age = k - newest
             ages = count_age(ages, before + 1, choice)
             variances = np.einsum("mi,ij,mj->m", rows, covs[age], rows)
             is_behind = age >= horizon
-            risk = compute_outside_risk(sides - rows @ mean, variances, 1.0 if is_behind else loop.widening)
+            risk = compute_outside_risk(sides - rows @ mean, variances, spread.spread)
             loop = charge_risk(loop, risk, ALLOWED, keeps_away=plan.offset > 0.0, is_behind_horizon=is_behind)
             if arrived[k]:
-                preview = Preview(level=ages.level, widening=loop.widening, silence_widening=loop.silence_widening)
+                preview = Preview(
+                    level=choice.levels[ages.rank],
+                    widening=round(choice.scales[ages.rank] * loop.widening, 2),
+                    silence_widening=loop.silence_widening,
+                )
                 plan = solver.solve(k, x, problem.target, preview if adapts else Preview())
         u = plan.inputs[min(k - newest, horizon - 1)]
         x = plant.a @ x + plant.b @ u + plant.e @ disturbances[k]

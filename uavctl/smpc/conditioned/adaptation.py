@@ -1,7 +1,8 @@
-"""Adaptation of the risk to the link and the disturbances as observed: certificate, levels and loop.
+"""Adaptation of the risk to the link and the disturbances as observed: certificate, budgets, loop and spread.
 
 1. *Certificate.* The same budget α = 1 - δ_x at every age holds for any loss process.
-2. *Levels.* A level of the budgets gives more to rare ages and less to frequent ones. It holds if
+2. *Budgets.* The budgets of a level give more to rare ages and less to frequent ones. A scale s of all standard
+   deviations makes them smaller: Φ(s Φ⁻¹(ε̄_t)). They hold if
 
        Σ_t π⁺_t max(ε̄_t - α, 0) <= Σ_t π⁻_t max(α - ε̄_t, 0)
 
@@ -10,10 +11,13 @@
    more of them.
 3. *Loop.* With the risk r_k of a step, given all that is known in it, all standard deviations are multiplied by f:
 
-       log f <- log f + γ (r_k / α - 0.95)
+       log f <- log f + γ (r_k / α - 0.93)
 
-   As long as f is within its bounds, the mean of r_k over T steps is at most α (0.95 + log(f_max / f_min) / (γ T)).
-4. *Silence.* Behind the horizon H no plan flies, and the spread grows on from where the last one ends. So the end of a
+   As long as f is within its bounds, the mean of r_k over T steps is at most α (0.93 + log(f_max / f_min) / (γ T)).
+4. *Spread.* r_k counts on the standard deviations of the model times v >= 1: v² is the mean of the squares of
+   the positions' innovations over that of their variances. Without v, a disturbance larger than the model's would hide
+   in silence.
+5. *Silence.* Behind the horizon H no plan flies, and the spread grows on from where the last one ends. So the end of a
    plan, of information H steps old, keeps a further factor g, with r_k counted where information is that old or older:
 
        log g <- log g + γ (r_k / α - 0.5)
@@ -24,14 +28,15 @@ All functions are pure: they depend on their arguments alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import gammaincinv, ndtr, ndtri
 
 from uavctl.arrays import Array
-from uavctl.smpc.conditioned.backoffs import compute_violation_risk
+from uavctl.smpc.conditioned.backoffs import MAX_RISK, compute_violation_risk
 
 # A step this old counts half: some two minutes at 20 Hz, so that a record follows a link that changes in a flight
 HALF_LIFE_STEPS = 2000.0
@@ -47,12 +52,12 @@ CONTRADICTION = 4.0
 # the judgement does not alternate
 AGREEMENT = 2.0
 AGREEMENT_STEPS = 1000.0  # least length of a record that no longer contradicts: a short one agrees with most links
-# Shares of the allowed risk by which the bounds may exceed it: where a level begins, and where it ends. The budgets of
+# Shares of the allowed risk by which the bounds may exceed it: where budgets begin, and where they end. The budgets of
 # all levels use all of it on the configured link, and bounds never fall to the link itself
 BEGIN_TOLERANCE = 0.05
 END_TOLERANCE = 0.08
-REVIEW_STEPS = 10  # steps between two choices of a level: one step changes a record little
-TARGET = 0.95  # share of α that the loop controls to: the rest is for the noise of f
+REVIEW_STEPS = 10  # steps between two choices of budgets: one step changes a record little
+TARGET = 0.93  # share of α that the loop controls to: the rest is for the noise of f and v
 GAIN = 0.002  # γ: an error of f falls to half in some 100 steps; 0.004 costs 6 % at a wall on the configured link
 # k_0: beside a limit the gain is 1 / (k_0 + k) while that is larger than γ, so the loop begins faster. Elsewhere a gust
 # of half a second at full speed would take f to its largest value, for the whole approach
@@ -62,51 +67,64 @@ MIN_WIDENING = 0.75  # least f: a bound on what quiet steps alone may take from 
 # learnt after the first silence comes too late on a link with long runs of losses
 FIRST_SILENCE_WIDENING = 2.0
 SILENCE_TARGET = 0.5  # share of α that ages behind the horizon may use: as much as those that plans fly in
+SPREAD_GAIN = 0.01  # weight of an innovation: v² of 100 of them is known to 14 %
+MOST_SQUARE = 16.0  # most that an innovation counts: one beyond four standard deviations tells of a wrong position
 MAX_WIDENING = 4.0  # largest f: beyond it plans leave most of the room, and f tells more of a wrong model than of risk
 # Least divisor and least number of events: keeps divisions and quantiles of empty records finite
 TINY = 1e-300
 
 
 class AgeRecord(msgspec.Struct, frozen=True):
-    """Record of the ages of the information that moved the vehicle, and the level that follows from it."""
+    """Record of the ages of the information that moved the vehicle, and the budgets that follow from it."""
 
     counts: tuple[float, ...] = ()  # steps with information 1 … H steps old, and older; forgotten gradually
     steps: int = 0  # steps so far
     contradicts: bool = False  # whether the record contradicts the configured link
-    level: int = 0  # level of the budgets; 0: the certificate
+    rank: int = 0  # rank of the budgets in `BudgetChoice`; 0: the certificate
 
 
 @dataclass(frozen=True, eq=False)
-class LevelChoice:
-    """What a level is chosen by."""
+class BudgetChoice:
+    """Budgets to choose from by rank: the certificate first, then those that give more and more to old information."""
 
     allowed: float  # α = 1 - δ_x
     shares: Array  # π_t (H+1,) of the configured link, the last one of all older ages
-    budgets: Array  # ε̄_t (L, H+1) of the levels; 1 for all older ages, except at the certificate
+    budgets: Array  # ε̄_t (K, H+1)
+    levels: tuple[int, ...]  # level of the planner's budgets (K,)
+    scales: tuple[float, ...]  # factor s of the standard deviations (K,), 1 or more
 
     @property
     def statistics(self) -> Array:
-        """Centred values of the ages (2, H+1) whose sums test a record: the design's budget, and the age itself."""
+        """Centred values of the ages (2, H+1) whose sums test a record: the last budgets, and the age itself."""
         values = np.vstack([self.budgets[-1], np.arange(1.0, len(self.shares) + 1.0)])
         return np.asarray(values - (values @ self.shares)[:, None])
 
 
-def count_age(record: AgeRecord, age: int, choice: LevelChoice) -> AgeRecord:
-    """Count a step that information `age` steps old (from 1 on) moved the vehicle in, and choose the level anew."""
+def scale_budgets(budgets: Array, scale: float) -> Array:
+    """Return the risk that is left of budgets ε̄ where all standard deviations count s times.
+
+    Rows that share a budget keep no more together than one row with all of it, as Φ(s Φ⁻¹(ε)) is convex up to ε = 1/2.
+    """
+    # Φ(s Φ⁻¹(ε̄))
+    return np.where(budgets < MAX_RISK, ndtr(scale * ndtri(np.minimum(budgets, MAX_RISK))), budgets)
+
+
+def count_age(record: AgeRecord, age: int, choice: BudgetChoice) -> AgeRecord:
+    """Count a step that information `age` steps old (from 1 on) moved the vehicle in, and choose the budgets anew."""
     weight, size = 0.5 ** (1.0 / HALF_LIFE_STEPS), len(choice.shares)
     counts = [weight * count for count in record.counts or (0.0,) * size]
     counts[min(max(age, 1), size) - 1] += 1.0
     steps = record.steps + 1
     if steps % REVIEW_STEPS:
-        return AgeRecord(tuple(counts), steps, record.contradicts, record.level)
+        return AgeRecord(tuple(counts), steps, record.contradicts, record.rank)
     contradicts = _contradicts(np.array(counts), record.contradicts, choice)
     if contradicts and not record.contradicts:  # the link has changed, and what was before says nothing of it
         counts = [0.0] * size
     lower, upper = bound_shares(np.array(counts), choice.shares, contradicts)
-    return AgeRecord(tuple(counts), steps, contradicts, choose_level(lower, upper, choice, record.level))
+    return AgeRecord(tuple(counts), steps, contradicts, choose_budgets(lower, upper, choice, record.rank))
 
 
-def _contradicts(counts: Array, before: bool, choice: LevelChoice) -> bool:
+def _contradicts(counts: Array, before: bool, choice: BudgetChoice) -> bool:
     """Return whether a record contradicts the configured link; one that did has to agree well for a while."""
     if before and counts.sum() < AGREEMENT_STEPS:
         return True
@@ -128,22 +146,20 @@ def bound_shares(counts: Array, shares: Array, contradicts: bool) -> tuple[Array
     return lower / scale, np.minimum(upper / scale, 1.0)
 
 
-def choose_level(lower: Array, upper: Array, choice: LevelChoice, before: int = 0) -> int:
-    """Choose the highest level that holds for all shares within the bounds; the certificate always does.
+def choose_budgets(lower: Array, upper: Array, choice: BudgetChoice, before: int = 0) -> int:
+    """Choose the highest rank whose budgets hold for all shares within the bounds; the certificate's always do.
 
     Args:
-        before: The level before. It and those below end at a larger excess than they begin at.
+        before: The rank before. It and those below end at a larger excess than they begin at.
     """
-    for level in range(len(choice.budgets) - 1, 0, -1):
-        excess = choice.budgets[level] - choice.allowed
-        tolerance = END_TOLERANCE if level <= before else BEGIN_TOLERANCE
-        spare = float(lower @ np.maximum(-excess, 0.0)) + tolerance * choice.allowed
-        if float(upper @ np.maximum(excess, 0.0)) <= spare:
-            return level
-    return 0
+    excess = choice.budgets - choice.allowed
+    tolerance = np.where(np.arange(len(excess)) <= before, END_TOLERANCE, BEGIN_TOLERANCE)
+    spare = np.maximum(-excess, 0.0) @ lower + tolerance * choice.allowed
+    holds = np.maximum(excess, 0.0) @ upper <= spare
+    return int(np.flatnonzero(holds)[-1])
 
 
-def find_contradiction(counts: Array, choice: LevelChoice) -> float:
+def find_contradiction(counts: Array, choice: BudgetChoice) -> float:
     """Return how many standard deviations the record is worse than the configured link."""
     # A run of losses is one draw: Y = Σ_{t<=G} v_t with P(G >= t) = π_t / π_1, Σ_t π_t v_t = 0
     begins = int(choice.shares.argmax())
@@ -181,13 +197,7 @@ class LoopState(msgspec.Struct, frozen=True):
 
 
 def charge_risk(
-    state: LoopState,
-    risk: float,
-    allowed: float,
-    *,
-    keeps_away: bool,
-    is_behind_horizon: bool,
-    begins_anywhere: bool = False,
+    state: LoopState, risk: float, allowed: float, *, keeps_away: bool, is_behind_horizon: bool
 ) -> LoopState:
     """Charge the risk of a step.
 
@@ -195,10 +205,9 @@ def charge_risk(
         risk: Probability that the state of the step is outside, given all that is known in it.
         keeps_away: Whether the plan keeps away from a limit. Elsewhere nothing is saved for later.
         is_behind_horizon: Whether the information of the step is H steps old or older.
-        begins_anywhere: Whether the larger first gain counts far from limits too, as in recordings of before.
     """
     # γ_k = max(γ, 1 / (k_0 + k)) beside a limit, else γ
-    gain = max(GAIN, 1.0 / (FIRST_STEPS + state.steps)) if keeps_away or begins_anywhere else GAIN
+    gain = max(GAIN, 1.0 / (FIRST_STEPS + state.steps)) if keeps_away else GAIN
     change = gain * (risk / allowed - TARGET)
     if change < 0.0 and not keeps_away:
         change = max(change, -max(state.log_widening, 0.0))
@@ -219,10 +228,38 @@ def _charge_silence(state: LoopState, relative_risk: float, gain: float) -> floa
     return min(max(log_widening, 0.0), math.log(MAX_WIDENING))
 
 
-def compute_outside_risk(margins: Array, variances: Array, widening: float) -> float:
+class SpreadState(msgspec.Struct, frozen=True):
+    """State of the spread: weighted means of the positions' innovations, in the position's unit squared."""
+
+    squares: float = 0.0  # of the squares ν²
+    variances: float = 0.0  # of the variances s² that the filter expects; 0 before the first position
+
+    @property
+    def spread(self) -> float:
+        """v, by which disturbances differ from the model's."""
+        return math.sqrt(self.squares / self.variances) if self.variances > 0.0 else 1.0
+
+
+def count_innovation(state: SpreadState, innovations: Sequence[float], variances: Sequence[float]) -> SpreadState:
+    """Count the innovations of a position, one of each axis.
+
+    The quotient of means gives weight to long silences: there coloured disturbances show, and W matters most.
+    """
+    # q <- q + 0.01 (Σ min(ν², 16 s²) - q),  p <- p + 0.01 (Σ s² - p),  v² = q / p
+    square = sum(min(v * v, MOST_SQUARE * s) for v, s in zip(innovations, variances, strict=True))
+    variance = sum(variances)
+    before = state if state.variances > 0.0 else SpreadState(variance, variance)
+    return SpreadState(
+        before.squares + SPREAD_GAIN * (square - before.squares),
+        before.variances + SPREAD_GAIN * (variance - before.variances),
+    )
+
+
+def compute_outside_risk(margins: Array, variances: Array, spread: float) -> float:
     """Compute the probability that any row is violated, at most, from the margins of the mean and the rows' variances.
 
-    The spread counts with f where that is above 1, else a disturbance larger than the model's would hide in silence.
+    Args:
+        spread: v, counted where it is above 1.
     """
-    # r = min(1, Σ_i Φ(-m_i / (max(1, f) σ_i)))
-    return min(1.0, float(compute_violation_risk(margins, max(1.0, widening) * np.sqrt(variances)).sum()))
+    # r = min(1, Σ_i Φ(-m_i / (max(1, v) σ_i)))
+    return min(1.0, float(compute_violation_risk(margins, max(1.0, spread) * np.sqrt(variances)).sum()))

@@ -41,7 +41,7 @@ from uavctl.smpc.answer import (
     is_finite,
 )
 from uavctl.smpc.batch import Decisions, gather_answers
-from uavctl.smpc.conditioned.adaptation import LevelChoice
+from uavctl.smpc.conditioned.adaptation import BudgetChoice, scale_budgets
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
     DISTANT_SHARE,
@@ -71,8 +71,11 @@ ROUNDS = 2  # rounds of an allocation
 # Rounds if the plan does not keep its back-offs: half of the plans between two near walls need the third.
 MAX_ROUNDS = 3
 # Largest budget of an age at each level between the certificate and the configured link, as a multiple of the allowed
-# risk: steps of a factor of at most two, so that a record frees risk gradually
-MAX_BUDGET_FACTORS = (1.25, 1.6, 2.5, 5.0)
+# risk: of those simulated from 1.25 to 5, the first is cheapest where losses come in long runs, the second elsewhere
+MAX_BUDGET_FACTORS = (2.5, 5.0)
+# Factors of the deviations with which these levels fly on links worse than the configured one: steps of a tenth, so
+# that a record frees risk gradually, up to what 80 % losses need
+SCALES = tuple(round(1.1**power, 2) for power in range(8, -1, -1))
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
@@ -142,7 +145,6 @@ class ConditionedSolver:
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
         has_lower_levels: Whether there are levels of the budgets below that of the configured link.
         bounds_slack: Whether new plans beside a limit may seldom need slack, see `compute_reference_backoffs`.
-        bounds_widening: Whether widening leaves a plan some room between opposite limits, see `bound_widening`.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
@@ -161,7 +163,6 @@ class ConditionedSolver:
         *,
         has_lower_levels: bool = False,
         bounds_slack: bool = True,
-        bounds_widening: bool = True,
     ) -> None:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
@@ -183,8 +184,7 @@ class ConditionedSolver:
         ]
         self._in_order = bool((self._rows == np.arange(problem.state_set.b.size)).all())
         self._c, self._b = problem.state_set.c[self._rows], problem.state_set.b[self._rows]
-        opposite = find_opposite_rows(self._c)
-        self._opposite = opposite if bounds_widening else opposite[:0]
+        self._opposite = find_opposite_rows(self._c)
         self._equilibria = find_equilibria(
             plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp)
         )
@@ -608,14 +608,23 @@ class ConditionedDecider:
         return gather_answers(answers, (problem.horizon, problem.plant.n_u))
 
 
-def make_level_choice(solver: ConditionedSolver, allowed: float) -> LevelChoice:
-    """Make the data by which a level of the budgets is chosen.
+def make_budget_choice(solver: ConditionedSolver, allowed: float) -> BudgetChoice:
+    """Make the budgets to choose from: the certificate, then each level between it and the configured link by scale.
+
+    What is older than the horizon, or than any plan can keep a limit for, has the certificate's budget at the first of
+    these levels: the end of its plans keeps away for a silence. At the others it counts in full.
 
     Args:
         allowed: 1 - δ_x.
     """
-    risk = solver.risk
-    budgets = np.array([level.near.risk.budgets for level in solver.levels])
-    # What is older than the horizon counts in full; the certificate knows no link, and promises nothing of it.
-    older = np.append(allowed, np.ones(len(budgets) - 1))[:, None]
-    return LevelChoice(allowed, np.append(risk.age_probabilities, risk.older_probability), np.hstack([budgets, older]))
+    risk, size = solver.risk, solver.problem.horizon + 1
+    budgets, levels, scales = [np.full(size, allowed)], [0], [1.0]
+    for level in range(1, len(solver.levels) - 1):
+        own = np.append(solver.levels[level].near.risk.budgets, 1.0)
+        for scale in SCALES:
+            scaled = scale_budgets(own, scale)
+            budgets.append(np.where(own < 1.0, scaled, allowed) if level == 1 else scaled)
+            levels.append(level)
+            scales.append(scale)
+    shares = np.append(risk.age_probabilities, risk.older_probability)
+    return BudgetChoice(allowed, shares, np.array(budgets), tuple(levels), tuple(scales))
