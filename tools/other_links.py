@@ -28,6 +28,7 @@ from uavctl.smpc.conditioned.adaptation import (
     LoopState,
     SpreadState,
     charge_risk,
+    combine_widenings,
     compute_outside_risk,
     count_age,
     count_innovation,
@@ -196,7 +197,7 @@ def fly(
                     age=age,
                     cov=preview.cov,
                     level=choice.levels[rank],
-                    widening=round(choice.scales[rank] * loop.widening, 2),
+                    widening=combine_widenings(choice.scales[rank], loop),
                     silence_widening=loop.silence_widening,
                 )
             plan, begun = solver.solve(0, mean, target, preview), k

@@ -21,7 +21,14 @@ from uavctl.flight.risk_state import RiskGroup, RiskParameters
 from uavctl.flight.supervise import Supervised
 from uavctl.records import Event, Plan, RiskRecord, Severity
 from uavctl.smpc.answer import CONFIGURED_LEVEL, Preview
-from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
+from uavctl.smpc.conditioned.adaptation import (
+    AgeRecord,
+    LoopState,
+    charge_risk,
+    combine_widenings,
+    compute_outside_risk,
+    count_age,
+)
 
 # The first positions of a source do not show its clock yet: a few round trips take two seconds, and the smallest delay
 # shows itself within as much.
@@ -43,8 +50,7 @@ def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | Non
         level, scale = parameters.choice.levels[rank], parameters.choice.scales[rank]
     if not parameters.adapts:
         return msgspec.structs.replace(preview, level=level, widening=scale)
-    # Rounded: plans of one value share their preparation.
-    widening = round(scale * risk.loop.widening, 2)
+    widening = combine_widenings(scale, risk.loop)
     return msgspec.structs.replace(preview, level=level, widening=widening, silence_widening=risk.loop.silence_widening)
 
 

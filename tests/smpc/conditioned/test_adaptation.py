@@ -174,6 +174,15 @@ def test_the_loop_saturates_where_nothing_helps() -> None:
     assert state.widening == adaptation.MAX_WIDENING
 
 
+def test_scale_and_loop_together_take_little_from_the_back_offs() -> None:
+    state = LoopState(steps=10**6)
+    for _ in range(5000):
+        state = charge_risk(state, 0.0, ALLOWED, keeps_away=True, is_behind_horizon=False)
+    assert state.widening == adaptation.MIN_WIDENING
+    assert adaptation.combine_widenings(1.0, state) == adaptation.MIN_TOTAL_WIDENING
+    assert adaptation.combine_widenings(2.0, state) == pytest.approx(1.0)
+
+
 def test_safe_steps_far_from_limits_lower_f_to_one_and_no_further() -> None:
     state = charge_risk(LoopState(), 1.0, ALLOWED, keeps_away=False, is_behind_horizon=False)
     assert state.widening > 1.0

@@ -18,6 +18,7 @@ from uavctl.smpc.conditioned.adaptation import (
     LoopState,
     SpreadState,
     charge_risk,
+    combine_widenings,
     compute_outside_risk,
     count_age,
     count_innovation,
@@ -77,7 +78,7 @@ def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapt
             if arrived[k]:
                 preview = Preview(
                     level=choice.levels[ages.rank],
-                    widening=round(choice.scales[ages.rank] * loop.widening, 2),
+                    widening=combine_widenings(choice.scales[ages.rank], loop),
                     silence_widening=loop.silence_widening,
                 )
                 plan = solver.solve(k, x, problem.target, preview if adapts else Preview())

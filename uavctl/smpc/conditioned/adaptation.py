@@ -62,7 +62,8 @@ GAIN = 0.002  # γ: an error of f falls to half in some 100 steps; 0.004 costs 6
 # k_0: beside a limit the gain is 1 / (k_0 + k) while that is larger than γ, so the loop begins faster. Elsewhere a gust
 # of half a second at full speed would take f to its largest value, for the whole approach
 FIRST_STEPS = 60.0
-MIN_WIDENING = 0.75  # least f: a bound on what quiet steps alone may take from the back-offs
+MIN_WIDENING = 0.5  # least f: where the scale asks for more than is needed, as in a corner, f takes it back
+MIN_TOTAL_WIDENING = 0.75  # least s f: a bound on what quiet steps alone may take from the back-offs
 # First g: the spread grows with the square root of time, so the end of a plan holds for a silence of 4 H steps. What is
 # learnt after the first silence comes too late on a link with long runs of losses
 FIRST_SILENCE_WIDENING = 2.0
@@ -182,12 +183,12 @@ class LoopState(msgspec.Struct, frozen=True):
 
     @property
     def widening(self) -> float:
-        """f, rounded: plans of one value share their preparation."""
+        """f, rounded."""
         return round(math.exp(self.log_widening), 2)
 
     @property
     def silence_widening(self) -> float:
-        """g, rounded as f."""
+        """g, rounded: plans of one value share their preparation."""
         return round(math.exp(self.log_silence_widening), 2)
 
     @property
@@ -226,6 +227,11 @@ def _charge_silence(state: LoopState, relative_risk: float, gain: float) -> floa
     change = relative_risk - SILENCE_TARGET
     log_widening = state.log_silence_widening + (GAIN if change < 0.0 else gain) * change
     return min(max(log_widening, 0.0), math.log(MAX_WIDENING))
+
+
+def combine_widenings(scale: float, loop: LoopState) -> float:
+    """Combine the scale s of the budgets and f of the loop, rounded: plans of one value share their preparation."""
+    return round(max(scale * loop.widening, MIN_TOTAL_WIDENING), 2)
 
 
 class SpreadState(msgspec.Struct, frozen=True):
