@@ -21,8 +21,8 @@ from uavctl.daemon import landing_guard
 from uavctl.daemon.landing_guard import LandingFrames
 from uavctl.daemon.landing_host import land
 from uavctl.errors import UavctlError
+from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.connection import Connection
 from uavctl.mavlink.landing import LandingRequest
 
 POSITION_CONTROL = 3 << 16
