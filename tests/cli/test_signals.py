@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import signal
+from pathlib import Path
 
 import pytest
 
+from uavctl.cli import flying
+from uavctl.cli.app import run
 from uavctl.cli.signals import DELIBERATE, END_LIMIT_S, stop_on_signals
 from uavctl.errors import EndedBySignal
 
@@ -55,3 +59,28 @@ def test_an_ignored_signal_stays_ignored() -> None:
             assert not stopped()
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.fault(86)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_after_the_flight_cuts_neither_its_page_nor_its_answer(
+    number: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Path] = []
+
+    def draw_page(path: Path, summary: object, page: Path) -> None:
+        del path, summary
+        signal.raise_signal(number)
+        drawn.append(page)
+
+    reached: list[int] = []
+    before = signal.signal(number, lambda number, _: reached.append(number))
+    if number not in DELIBERATE:
+        signal.signal(number, signal.SIG_DFL)  # others are handled only where they would kill
+    monkeypatch.setattr(flying, "draw_page", draw_page)
+    try:
+        code = run(["loopback", "--duration", "1", "--out", str(tmp_path / "f"), "--json"])
+    finally:
+        signal.signal(number, before)
+    assert code == 0 and not reached
+    assert json.loads(capsys.readouterr().out)["report"] == str(drawn[0])

@@ -5,6 +5,9 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from mavlink_rig import OFFBOARD, Peer
@@ -12,9 +15,14 @@ from patience import LIMIT_S
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
+from uavctl.config import load_config
 from uavctl.config.connections import HandOverConfig
+from uavctl.daemon import landing_guard
 from uavctl.daemon.landing_guard import LandingFrames
 from uavctl.daemon.landing_host import land
+from uavctl.errors import UavctlError
+from uavctl.io.base import Connection
+from uavctl.loop import ControlLoop
 from uavctl.mavlink.landing import LandingRequest
 
 POSITION_CONTROL = 3 << 16
@@ -80,3 +88,24 @@ def test_103_landing_is_asked_for_until_the_vehicle_accepts(ends: Ends) -> None:
 @pytest.mark.fault(103)
 def test_103_a_vehicle_that_says_nothing_is_asked_for_a_limited_time(ends: Ends) -> None:
     assert not ask(ends, 0.5).is_answered
+
+
+@pytest.mark.fault(103)
+@pytest.mark.parametrize(
+    ("error", "lands"), [(KeyboardInterrupt(), True), (SystemExit(130), True), (UavctlError("no flight"), False)]
+)
+def test_103_a_flight_that_ends_at_once_leaves_the_vehicle_to_the_process(
+    error: BaseException, lands: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, theirs = socket.socketpair()
+    helper = SimpleNamespace(socket=ours, close=ours.close)
+    monkeypatch.setattr(landing_guard, "HelperProcess", lambda *_, **__: helper)
+    with theirs:
+        connection = cast("Connection", None)
+        with (
+            pytest.raises(type(error)),
+            landing_guard.guard_landing(cast("ControlLoop", None), load_config("room"), connection, Path("x"), print),
+        ):
+            raise error
+        theirs.settimeout(LIMIT_S)
+        assert theirs.recv(64) == (b"" if lands else landing_guard.END)

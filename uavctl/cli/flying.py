@@ -22,7 +22,7 @@ from logs.recording.recorder import DerivedTopics, RecorderStatus
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, label_text, print_message
-from uavctl.cli.signals import SIGNAL_EXIT_BASE
+from uavctl.cli.signals import SIGNAL_EXIT_BASE, stop_on_signals
 from uavctl.daemon.flight_orders import make_goto_keys
 from uavctl.errors import ConnectionClosedError, RecordingError, TickOverdueError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
@@ -144,6 +144,8 @@ def report_dead_view(reason: str) -> None:
 def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
     """Read the closed recording, summarise it and draw its page; a failure of the page is only printed.
 
+    The flight is over: a first signal ends nothing any more, a second deliberate one ends the command.
+
     Args:
         path: Path of the recording.
         wall_s: Duration of the flight [s].
@@ -155,22 +157,23 @@ def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: E
     print_losses(status)
     if not status.segments and status.gone:
         raise RecordingError(f"{path}: {status.reason}; nothing of the flight is on the disk")
-    flight = FlightData.from_records(read(path), path)
-    page = path.with_suffix(".html")
-    summary = summarise(
-        flight,
-        wall_s=wall_s,
-        recording=str(path),
-        report=str(page),
-        recorder_dropped=0 if status.ok else count_missing_records(status),
-        ending=None if ending is None else describe_ending(ending, status),
-    )
-    try:
-        draw_page(path, summary, page)
-    except UavctlError as error:  # the flight and its recording are complete
-        print_message(label_text("warning", f"no page: {error}"))
-        summary = replace(summary, report=None)
-    return summary
+    with stop_on_signals():
+        flight = FlightData.from_records(read(path), path)
+        page = path.with_suffix(".html")
+        summary = summarise(
+            flight,
+            wall_s=wall_s,
+            recording=str(path),
+            report=str(page),
+            recorder_dropped=0 if status.ok else count_missing_records(status),
+            ending=None if ending is None else describe_ending(ending, status),
+        )
+        try:
+            draw_page(path, summary, page)
+        except UavctlError as error:  # the flight and its recording are complete
+            print_message(label_text("warning", f"no page: {error}"))
+            summary = replace(summary, report=None)
+        return summary
 
 
 def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:

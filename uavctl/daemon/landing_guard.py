@@ -101,7 +101,7 @@ def guard_landing(
     guard = LandingGuard(helper, loop, connection, round(hand_over.answer_s * SECOND_NS))
     try:
         yield (guard.after_tick,)
-    except SystemExit:  # the second signal of the operator: nothing here waits for the landing
+    except (SystemExit, KeyboardInterrupt):  # the operator ends at once: nothing here waits for the landing
         guard.leave()
         raise
     except BaseException:

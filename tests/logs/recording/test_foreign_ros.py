@@ -190,6 +190,15 @@ def test_what_has_not_the_fields_is_not_taken_for_it() -> None:
     assert make_unwrapper("json", "jsonschema", "x", b"{}") is None
 
 
+@pytest.mark.fault(96)
+@pytest.mark.parametrize("digits", [11, 5000])
+def test_an_array_longer_than_any_message_is_not_taken_for_it(digits: int) -> None:
+    definition = f"{DEFINITION1.replace('uint8[] signature', f'uint8[{9 * 10**9}] more')}".encode()
+    assert make_unwrapper(ROS1, "ros1msg", NAME1, definition) is not None
+    definition = definition.replace(b"9000000000", b"9" * digits)
+    assert make_unwrapper(ROS1, "ros1msg", NAME1, definition) is None
+
+
 def test_a_damaged_message_is_told_never_raised() -> None:
     packet = read_tlog(DATA / TLOGS[0]).packets[3].data
     unwrap = make_unwrapper(ROS2, "ros2msg", NAME2, DEFINITION2.encode())
