@@ -528,6 +528,60 @@ def test_positions_are_wrong_where_inertial_data_and_the_vehicle_s_own_velocity_
     assert 2.0 < min(braked[0.3]) < 2.5
 
 
+def blow(wind_s: float, *, moves: bool, dark_s: float = 0.6) -> list[TickOutput]:
+    """Ticks of a vehicle on which a wind of 1 m/s² sets in after 2 s, or whose inertial data say so, and positions end.
+
+    Args:
+        wind_s: `inertial_wind_s` of the estimator.
+        moves: Whether the vehicle moves as its inertial data say.
+        dark_s: Time without positions.
+    """
+    envelope = replace(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3)
+    controller = replace(controller_that_feels(inertial_wind_s=wind_s, bias_max=3.0), envelope=envelope)
+    state, told = make_initial_state(), []
+    for tick in range(3 * 20):
+        at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
+        blown_s = max(s - 2.0, 0.0)
+        accel_mps2 = 1.0 if blown_s > 0.0 else 0.001 * (tick % 7)
+        blown_s = blown_s if moves else 0.0
+        speed_mps, north_m = blown_s + 0.001 * (tick % 7), 0.5 * blown_s**2
+        is_dark = 2.0 < s <= 2.0 + dark_s
+        given = StepInput(
+            tick=tick,
+            at_ns=at_ns,
+            samples=() if is_dark else (sample(at_ns, position_m=(north_m, 0.0, 0.0)),),
+            vehicle=vehicle(),
+            motion=motion((speed_mps, 0.0, 0.0), at_ns),
+            inertial=felt_at(at_ns - MS, accel_mps2),
+        )
+        state, one = run_tick(state, given, controller)
+        told.append(one)
+    return told
+
+
+def find_times_s(told: list[TickOutput], code: EventCode) -> list[float]:
+    return [0.05 * tick - 2.0 for tick, one in enumerate(told) for event in one.events if event.code == code]
+
+
+@pytest.mark.fault(58)
+@pytest.mark.fault(71)
+def test_a_wind_that_sets_in_is_believed_where_the_vehicle_s_own_velocity_changes_as_inertial_data_do() -> None:
+    told = blow(0.5, moves=True)
+    (doubted_s,), used_s = find_times_s(told, EventCode.INERTIAL_DOUBTED), find_times_s(told, EventCode.INERTIAL_USED)
+    assert 0.1 <= doubted_s <= 0.2 and used_s[0] - doubted_s == pytest.approx(0.5, abs=0.06)
+    assert all(one.decision.mode == "track" for one in told[2:])
+    before = blow(0.0, moves=True)
+    assert find_times_s(before, EventCode.INERTIAL_USED) == []
+    assert any(one.decision.mode == "brake" for one in before)
+
+
+@pytest.mark.fault(59)
+def test_inertial_data_that_the_vehicle_s_own_velocity_contradicts_are_not_used_again() -> None:
+    told = blow(0.5, moves=False)
+    assert find_times_s(told, EventCode.INERTIAL_DOUBTED) and not find_times_s(told, EventCode.INERTIAL_USED)
+    assert any(one.decision.mode == "brake" for one in told)
+
+
 def test_a_fallback_that_ends_holds_by_nothing() -> None:
     controller = controller_that_feels()
     kalman, plant = controller.kalman, controller.plant
