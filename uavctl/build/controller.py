@@ -334,7 +334,6 @@ def build_estimator(config: Config) -> EstimatorParameters:
         inertial_std_mps2=estimator.inertial_std_mps2,
         inertial_bias_mps2=estimator.inertial_bias_mps2,
         inertial_bias_s=estimator.inertial_bias_s,
-        inertial_wind_s=estimator.inertial_wind_s,
     )
 
 

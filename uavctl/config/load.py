@@ -284,7 +284,6 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
     old_values = {
         ("daemon", "parameters"): "false",
         ("daemon", "radio_channels"): "false",
-        ("estimator", "inertial_wind_s"): "0.0",
         ("relay", "vehicle_time"): "false",
         ("risk", "budgets"): '"configured"',
         ("risk", "from_first_position"): "false",

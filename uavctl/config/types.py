@@ -476,16 +476,6 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     inertial_bias_s: Annotated[
         float, Meta(ge=0.1, le=MAX_DURATION_S, description="time in which that comes and goes [s]")
     ] = 20.0
-    inertial_wind_s: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=MAX_DURATION_S,
-            description="inertial data that contradict the model alone are used again after so long, where the "
-            "vehicle's own velocity changes as they do: a wind has set in; 0, as in recordings of before: not sooner "
-            "than others [s]",
-        ),
-    ] = 0.5
 
 
 class FallbackConfig(Section, frozen=True, kw_only=True):

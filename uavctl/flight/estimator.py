@@ -29,7 +29,6 @@ from uavctl.flight.kalman import (
     update_with_inertial,
     update_with_position,
 )
-from uavctl.flight.monitors.inertial import UNUSED
 from uavctl.records import Estimate, InertialSample, PositionSample, Vec3
 
 # Largest time of a stamp after the arrival. Clocks over a link are known to milliseconds, and a stamp further off says
@@ -62,7 +61,6 @@ class FilterEvent(msgspec.Struct, frozen=True, eq=False):
     input: Array | None = None  # of an input change; None: others fly from here on
     accel_mps2: Array | None = None  # of inertial data: what they show of each axis of the plant
     distrusts_inertial: bool = False  # inertial data are distrusted from here on
-    trusts_inertial: bool = False  # they are used from here on, as in a flight that begins in wind
 
 
 class FilterHistory(msgspec.Struct, frozen=True, eq=False):
@@ -192,11 +190,6 @@ def distrust_inertial(history: FilterHistory, at_ns: int) -> FilterHistory:
     kept = [entry for place, entry in enumerate(history.entries) if place <= newest or entry.accel_mps2 is None]
     history = _keep_entries(history, kept)
     return _insert(history, FilterEvent(key=(at_ns, _MARK, "distrusted", at_ns), distrusts_inertial=True))
-
-
-def trust_inertial(history: FilterHistory, at_ns: int) -> FilterHistory:
-    """Use inertial data again that were distrusted, as in a flight that begins in wind."""
-    return _insert(history, FilterEvent(key=(at_ns, _MARK, "trusted", at_ns), trusts_inertial=True))
 
 
 def average_vectors(vectors: Sequence[Vec3]) -> Vec3:
@@ -419,6 +412,4 @@ def _apply_entry(
         belief = update_with_inertial(kalman, belief, entry.accel_mps2, before.input)
     if entry.distrusts_inertial and belief is not None and belief.inertial.distrusted_ns is None:
         belief = replace(belief, inertial=replace(belief.inertial, distrusted_ns=entry.key[0]))
-    if entry.trusts_inertial and belief is not None:
-        belief = replace(belief, inertial=UNUSED)
     return FilterState(belief=belief, input=entry.input if entry.key[1] == _INPUT else before.input)

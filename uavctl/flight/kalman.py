@@ -56,9 +56,6 @@ class EstimatorParameters:
     inertial_std_mps2: float = 0.0
     inertial_bias_mps2: float = 0.1  # standard deviation of what they are off for longer [m/s²]
     inertial_bias_s: float = 20.0  # time in which that comes and goes [s]
-    # Time after which inertial data that the model alone contradicts are used again, where the vehicle's own velocity
-    # changes as they do [s]; 0: they wait as long as all others
-    inertial_wind_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

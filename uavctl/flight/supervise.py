@@ -46,7 +46,6 @@ from uavctl.flight.estimator import (
     make_estimate,
     predict_ahead,
     predict_belief,
-    trust_inertial,
 )
 from uavctl.flight.fallback import FallbackReason
 from uavctl.flight.kalman import Belief, read_capture_ns
@@ -60,6 +59,7 @@ from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
 from uavctl.flight.monitors.velocity import CORRECTS_NS
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
 from uavctl.records import ControlMode, Estimate, Order
@@ -135,8 +135,6 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
     """Run the monitors, and turn their verdicts into actions."""
     controller, at_ns, samples = context.controller, context.at_ns, measured.samples
     view = view_filter(measured.history, context)
-    if _has_wind_set_in(state, view, context):
-        view = view_filter(trust_inertial(view.history, context.at_ns), context)
     contradiction, inertial_verdict = _judge_estimate(state, view, measured, context)
     if not inertial_verdict.is_none:
         view = view_filter(distrust_inertial(view.history, at_ns), context)
@@ -183,24 +181,6 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
         position_inconsistent=unengaged.position_inconsistent,
         newest_inconsistent=unengaged.newest_inconsistent,
     )
-
-
-def _is_wind_likely(monitors: MonitorState, view: FilterView, context: TickContext) -> bool:
-    """Whether the model alone contradicts inertial data, and the vehicle's own velocity changes as they do."""
-    change = monitors.velocity_change
-    if view.belief is None or not context.controller.kalman.parameters.inertial_wind_s:
-        return False
-    has_both = bool(change.samples) and change.samples[-1][2] is not None
-    is_supported = has_both and not change.contradicts and change.supports_velocity(context.at_ns)
-    return is_supported and inertial.contradict_model_alone(view.belief.inertial)
-
-
-def _has_wind_set_in(state: ControlState, view: FilterView, context: TickContext) -> bool:
-    """Whether inertial data are distrusted for a wind that has set in: the vehicle's own velocity bears them out."""
-    if view.belief is None or not _is_wind_likely(state.monitors.engaged, view, context):
-        return False
-    lasts_s, since_ns = context.controller.kalman.parameters.inertial_wind_s, view.belief.inertial.distrusted_ns
-    return since_ns is not None and context.at_ns - since_ns >= lasts_s * 1e9
 
 
 def _drop_after(history: FilterHistory, dropped_after_ns: int) -> FilterHistory:
@@ -371,9 +351,15 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
         return _CONTRADICTED
     is_wrong = change.inertial_wrong_ns is not None or trust.distrusted_ns is not None
     is_lost = is_wrong or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
-    if not is_lost or _is_wind_likely(monitors, view, context):
+    if not is_lost or (inertial.contradict_model_alone(trust) and _are_supported(change, context.at_ns)):
         return NO_VERDICT
     return _CARRIED_BY_NOTHING if are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
+
+
+def _are_supported(change: VelocityChangeState, at_ns: int) -> bool:
+    """Whether the vehicle's own velocity changes as its inertial data do: what the model does not explain is wind."""
+    has_both = bool(change.samples) and change.samples[-1][2] is not None
+    return has_both and not change.contradicts and change.supports_velocity(at_ns)
 
 
 def are_positions_lost(belief: Belief | None, at_ns: int) -> bool:

@@ -4,7 +4,7 @@
 2. A position far from where inertial data carried the estimate: they are distrusted.
 3. A velocity that they carried on differs from the vehicle's own, which may be believed: they are distrusted.
 4. Distrust ends with a position that agrees, three seconds later at the earliest. Where the model alone was the reason,
-   it ends sooner if the vehicle's own velocity changes as they do: a wind has set in, and they show it.
+   and the vehicle's own velocity changes as they do, it is wind: then a silence is no reason to brake.
 
 A late sample changes what came after it, so the filter keeps this state in each belief (`uavctl.flight.kalman`).
 
