@@ -102,6 +102,7 @@ def sum_samples(
     return tuple(count * value for value in sums)
 
 
+@pytest.mark.fault(71)
 @pytest.mark.fault(101)
 @pytest.mark.parametrize(("axis", "side"), LIMITS)
 def test_a_wind_that_answered_setpoints_show_asks_for_nothing(axis: int, side: float) -> None:
@@ -129,6 +130,23 @@ def test_each_bound_of_an_answer_counts(answered: tuple[float, ...], not_answere
     assert is_found(recent=sum_samples(0, 1.0, *not_answered))
 
 
+@pytest.mark.parametrize(("axis", "side"), LIMITS)
+def test_a_wind_counts_that_blows_to_the_limit_by_more_than_before(axis: int, side: float) -> None:
+    at_ns = START_NS + 1000 * MS
+
+    def is_found_in(wind_mps2: float, push_mps2: float, asked_mps2: float, got_mps2: float = 0.0) -> bool:
+        wind = (at_ns - 1, side * wind_mps2)
+        winds = tuple(wind if place == axis else None for place in range(3))
+        return is_found(axis, side, winds=winds, push_mps2=push_mps2, asked_mps2=asked_mps2, got_mps2=got_mps2)
+
+    for push_mps2 in (0.2, -0.2):
+        assert is_found_in(push_mps2 + 0.3 - 1e-9, push_mps2, 0.6)
+        assert not is_found_in(push_mps2 + 0.3 + 1e-9, push_mps2, 0.6)
+        assert is_found_in(push_mps2 + 0.3 + 1e-9, push_mps2, 0.9)
+        assert not is_found_in(push_mps2 - 1.0, push_mps2, 0.4)  # a wind that goes down asks for no more
+    assert is_found_in(1.0, 0.0, 1.0, got_mps2=-0.6)  # what was learned before is no reason for a gain now
+
+
 def test_a_wind_that_was_learned_counts_for_three_seconds() -> None:
     at_ns = START_NS + 1000 * MS
     assert not is_found(winds=((at_ns - 3000 * MS, 1.0), None, None))
@@ -137,7 +155,9 @@ def test_a_wind_that_was_learned_counts_for_three_seconds() -> None:
     observation, learned = TickObservation(tick, Motion(), PARAMETERS), sum_samples(1, 0.9, 0.1, 0.6)
     before = ApproachState(winds=((at_ns - 5, 0.3), (at_ns - 9, 0.2), (at_ns - 4000 * MS, 0.1)))
     state, _ = approach.update(before, observation, VelocityChangeState(), ResponseState(recent=learned))
-    assert state.winds == ((at_ns - 5, 0.3), (at_ns, pytest.approx(0.9)), None)
+    north, east, down = state.winds
+    assert north == (at_ns - 5, 0.3) and east is not None and down is None
+    assert east[0] == at_ns and east[1] == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize(

@@ -365,7 +365,7 @@ def _are_supported(change: VelocityChangeState, at_ns: int) -> bool:
 
 
 def _is_near_limit(view: FilterView, context: TickContext) -> bool:
-    """Whether the vehicle reaches a limit within `NEAR_S` by its own velocity. A wrong response looks like wind there."""
+    """Whether the vehicle reaches a limit within `NEAR_S` by its own velocity: a wrong response may look like wind."""
     bounds, own = context.controller.envelope, read_vehicle_velocity(context.inputs.motion, context.at_ns)
     if bounds is None or own is None:
         return True
