@@ -38,7 +38,7 @@ def is_found(
     left_m: float = 0.5,
     push_mps2: float = 0.0,
     span_ns: int = 1000 * MS,
-    since_ns: int = 100 * MS,
+    since_ns: int | None = 100 * MS,
     velocity_wrong_ns: int | None = None,
     has_position: bool = True,
     recent: tuple[float, ...] = (0.0,) * 13,
@@ -62,9 +62,12 @@ def is_found(
     response = ResponseState(recent=recent, baseline=(2.0, *along(axis, 2.0 * side * push_mps2), 0.0, 0.0, 0.0))
     tick = structs.replace(seen(at_ns), position_m=place if has_position else None)
     observation = TickObservation(tick, Motion(), PARAMETERS)
-    state, verdict = approach.update(ApproachState(at_ns - since_ns, winds), observation, change, response)
+    state, verdict = approach.update(
+        ApproachState(None if since_ns is None else at_ns - since_ns, winds), observation, change, response
+    )
     assert verdict.is_none or (verdict.action, verdict.cause) == (Action.END_PLANS, EventCode.SETPOINT_RESPONSE)
-    assert verdict.is_none or state.since_ns == at_ns - since_ns
+    assert verdict.is_none or (since_ns is not None and state.since_ns == at_ns - since_ns)
+    assert since_ns is not None or state.since_ns == at_ns
     return not verdict.is_none
 
 
@@ -75,6 +78,10 @@ def test_a_deceleration_that_does_not_come_before_a_limit_ends_the_plans(axis: i
     assert is_found(axis, side, left_m=-0.3)
     assert not is_found(axis, side, got_mps2=0.3)
     assert not is_found(axis, side, asked_mps2=-1.0)  # it is asked to fly there
+
+
+def test_it_has_to_last_from_its_first_tick_on() -> None:
+    assert not is_found(since_ns=None)
 
 
 @pytest.mark.parametrize(("axis", "side"), LIMITS)
@@ -130,6 +137,26 @@ def test_each_bound_of_an_answer_counts(answered: tuple[float, ...], not_answere
     assert is_found(recent=sum_samples(0, 1.0, *not_answered))
 
 
+@pytest.mark.parametrize(
+    ("left_mps2", "squared", "shown_squared", "is_answered"),
+    [
+        (0.0, 0.0, 0.0625, False),
+        (0.0, 0.0, 0.0626, True),
+        (0.0, 0.5, 1.0, False),
+        (0.0, 0.4999, 1.0, True),
+        (0.7, 1.0, 1.0, False),
+        (0.7, 0.98, 1.0, True),
+    ],
+)
+def test_the_parts_of_a_variance_count(
+    left_mps2: float, squared: float, shown_squared: float, is_answered: bool
+) -> None:
+    recent = (4.0, 4.0 * left_mps2, 0.0, 0.0, 4.0 * squared, 0.0, 0.0, 0.0, 0.0, 0.0, 4.0 * shown_squared, 0.0, 0.0)
+    observation = TickObservation(seen(START_NS), Motion(), PARAMETERS)
+    state, _ = approach.update(ApproachState(), observation, VelocityChangeState(), ResponseState(recent=recent))
+    assert state.winds == ((START_NS, left_mps2) if is_answered else None, None, None)
+
+
 @pytest.mark.parametrize(("axis", "side"), LIMITS)
 def test_a_wind_counts_that_blows_to_the_limit_by_more_than_before(axis: int, side: float) -> None:
     at_ns = START_NS + 1000 * MS
@@ -144,6 +171,7 @@ def test_a_wind_counts_that_blows_to_the_limit_by_more_than_before(axis: int, si
         assert not is_found_in(push_mps2 + 0.3 + 1e-9, push_mps2, 0.6)
         assert is_found_in(push_mps2 + 0.3 + 1e-9, push_mps2, 0.9)
         assert not is_found_in(push_mps2 - 1.0, push_mps2, 0.4)  # a wind that goes down asks for no more
+    assert is_found_in(0.3, 0.0, 0.6)
     assert is_found_in(1.0, 0.0, 1.0, got_mps2=-0.6)  # what was learned before is no reason for a gain now
 
 
