@@ -167,11 +167,11 @@ def test_a_wind_counts_that_blows_to_the_limit_by_more_than_before(axis: int, si
         return is_found(axis, side, winds=winds, push_mps2=push_mps2, asked_mps2=asked_mps2, got_mps2=got_mps2)
 
     for push_mps2 in (0.2, -0.2):
-        assert is_found_in(push_mps2 + 0.3 - 1e-9, push_mps2, 0.6)
-        assert not is_found_in(push_mps2 + 0.3 + 1e-9, push_mps2, 0.6)
-        assert is_found_in(push_mps2 + 0.3 + 1e-9, push_mps2, 0.9)
+        assert is_found_in(push_mps2 + 0.45 - 1e-9, push_mps2, 0.8)
+        assert not is_found_in(push_mps2 + 0.45 + 1e-9, push_mps2, 0.8)
+        assert is_found_in(push_mps2 + 0.45 + 1e-9, push_mps2, 1.0)
         assert not is_found_in(push_mps2 - 1.0, push_mps2, 0.4)  # a wind that goes down asks for no more
-    assert is_found_in(0.3, 0.0, 0.6)
+    assert is_found_in(0.45, 0.0, 0.7)
     assert is_found_in(1.0, 0.0, 1.0, got_mps2=-0.6)  # what was learned before is no reason for a gain now
 
 

@@ -71,7 +71,7 @@ ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING, Eve
 # Without positions and inertial data for so long, a plan is not flown on. A gust makes inertial data implausible for a
 # shorter time, and a burst of losses is shorter.
 LOST_NS = 400_000_000
-NEAR_S = 1.5  # time to a limit up to which a wind that may be a wrong response is no reason to fly on
+NEAR_S = 2.0  # time to a limit up to which a wind that may be a wrong response is no reason to fly on
 # Positions that came back so lately after a silence are wrong where two other sources contradict them. Those that never
 # were away may be late by the smoothing of a camera system.
 RETURNED_NS = 4_000_000_000

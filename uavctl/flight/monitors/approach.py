@@ -7,11 +7,11 @@
    Then: end the plans. The vehicle's own landing brakes without setpoints.
 3. A wind that sets in is told from a response that is dead by changes: where setpoints leave less than half of the
    variance of the acceleration, over the last half second, they are answered. What they leave in the mean is the wind,
-   for three seconds, if it blows to the limit by 0.3 m/s² more than before. While they are answered, a gain is wind.
+   for three seconds, if it blows to the limit by 0.45 m/s² more than before. While they are answered, a gain is wind.
 
 False alarms: 0 of 600 healthy flights in gusts of 3 and 8 m/s, with noise of 5 cm, blackouts and take-offs; 0
 of 86 slow approaches to walls, and hovers before them, in steady wind; 0 of 125 where a wind of 2 to 3 m/s sets
-in near a wall, or one of 3 to 4 m/s with ArduPilot. With PX4 it is 0 of 95 there, 15 before winds were learned.
+in near a wall, or one of 3 to 4 m/s with ArduPilot. With PX4 15 of 95 were before winds were learned; these fly on.
 Vehicles whose mass is off by 15 % from the first tick on rise or sink by 0.5 to 0.9 m/s, and are let go (PX4, 10 of
 12).
 """
@@ -38,7 +38,7 @@ PERSISTS_NS = 100_000_000
 # Least standard deviation of an acceleration that shows whether setpoints are answered, and the part of its variance
 # that they leave if they are.
 SHOWN_MPS2, LEFT_PART = 0.25, 0.5
-SETS_IN_MPS2 = 0.3  # least change of a wind towards the limit that counts: gusts make less
+SETS_IN_MPS2 = 0.45  # least change of a wind towards the limit that counts: gusts make less
 KNOWN_NS = 3_000_000_000  # a wind that answered setpoints have shown counts for so long
 
 
