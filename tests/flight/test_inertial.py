@@ -528,6 +528,55 @@ def test_positions_are_wrong_where_inertial_data_and_the_vehicle_s_own_velocity_
     assert 2.0 < min(braked[0.3]) < 2.5
 
 
+def blow(*, moves: bool = True, has_velocity: bool = True, left_m: float = 9.0) -> list[TickOutput]:
+    """Ticks of a vehicle on which a wind of 1 m/s² sets in after 2 s, or whose inertial data say so, and positions end.
+
+    Args:
+        moves: Whether the vehicle moves as its inertial data say.
+        has_velocity: Whether the vehicle sends its own velocity.
+        left_m: Way to a limit in the direction of the wind.
+    """
+    envelope = replace(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3, upper_m=(left_m, 9.0, 9.0))
+    controller = replace(controller_that_feels(), envelope=envelope)
+    state, told = make_initial_state(), []
+    for tick in range(3 * 20):
+        at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
+        blown_s = max(s - 2.0, 0.0)
+        accel_mps2 = 1.0 if blown_s > 0.0 else 0.001 * (tick % 7)
+        blown_s = blown_s if moves else 0.0
+        speed_mps, north_m = blown_s + 0.001 * (tick % 7), 0.5 * blown_s**2
+        is_dark = 2.0 < s <= 2.6
+        given = StepInput(
+            tick=tick,
+            at_ns=at_ns,
+            samples=() if is_dark else (sample(at_ns, position_m=(north_m, 0.0, 0.0)),),
+            vehicle=vehicle(),
+            motion=motion((speed_mps, 0.0, 0.0), at_ns) if has_velocity else None,
+            inertial=felt_at(at_ns - MS, accel_mps2),
+        )
+        state, one = run_tick(state, given, controller)
+        told.append(one)
+    return told
+
+
+@pytest.mark.fault(71)
+def test_a_wind_is_no_reason_to_brake_in_a_silence_where_the_vehicle_s_own_velocity_shows_it_too() -> None:
+    told = blow()
+    assert any(event.code == EventCode.INERTIAL_DOUBTED for one in told for event in one.events)
+    assert all(one.decision.mode == "track" for one in told[2:])
+
+
+@pytest.mark.fault(59)
+@pytest.mark.parametrize(
+    ("moves", "has_velocity", "left_m"), [(False, True, 9.0), (True, False, 9.0), (True, True, 0.6)]
+)
+def test_it_brakes_where_that_may_be_a_lie_or_a_wrong_response_before_a_limit(
+    moves: bool, has_velocity: bool, left_m: float
+) -> None:
+    told = blow(moves=moves, has_velocity=has_velocity, left_m=left_m)
+    assert any(one.decision.mode == "brake" for one in told)
+
+
 def test_a_fallback_that_ends_holds_by_nothing() -> None:
     controller = controller_that_feels()
     kalman, plant = controller.kalman, controller.plant

@@ -13,6 +13,7 @@ from uavctl.flight.monitors.inertial import (
     ComparedSource,
     InertialObservation,
     InertialTrust,
+    contradict_model_alone,
     is_consistent,
     is_plausible,
     update,
@@ -42,6 +43,14 @@ def test_three_readings_in_a_row_that_the_model_refuses_are_distrusted() -> None
         trust = compare(trust, ComparedSource.MODEL, agrees, at_ns)
     assert (trust.used_ns, trust.refused, trust.distrusted_ns) == (4, 2, None)
     assert compare(trust, ComparedSource.MODEL, False, 7).distrusted_ns == 7
+
+
+def test_the_model_alone_was_the_reason_where_three_readings_were_refused() -> None:
+    refused = InertialTrust(used_ns=5, refused=2)
+    distrusted = compare(refused, ComparedSource.MODEL, False, 7)
+    assert contradict_model_alone(distrusted) and not contradict_model_alone(refused)
+    for source in (ComparedSource.POSITION, ComparedSource.VEHICLE_VELOCITY):
+        assert not contradict_model_alone(compare(refused, source, False, 7, captured_ns=4))
 
 
 @pytest.mark.parametrize("source", [ComparedSource.POSITION, ComparedSource.VEHICLE_VELOCITY])

@@ -311,7 +311,7 @@ def test_the_cause_says_where_the_position_is_not_known() -> None:
 def test_a_gap_in_inertial_data_begins_anew() -> None:
     last = START_NS, (1.0, *[0.0] * 9)
     state = ResponseState(
-        requested=((START_NS, ZERO),), inertial_ns=START_NS, samples=(last,), recent=(1.0, *[0.0] * 6)
+        requested=((START_NS, ZERO),), inertial_ns=START_NS, samples=(last,), recent=(1.0, *[0.0] * 12)
     )
     for gap_ns, count in ((300 * MS, 1.0), (300 * MS + 1, 0.0)):
         tick = structs.replace(seen(START_NS + gap_ns), inertial_mps2=ZERO)
@@ -604,7 +604,8 @@ def test_sums_of_equal_samples_are_geometric_series() -> None:
     short, long = (
         w * (1.0 - math.exp(-n * 0.05 / memory_s)) / (1.0 - math.exp(-0.05 / memory_s)) for memory_s in (0.4, 10.0)
     )
-    assert state.recent == pytest.approx([short * x for x in (1.0, 2.0, -0.5, 0.5, 4.0, 0.25, 0.25)])
+    recent = (1.0, 2.0, -0.5, 0.5, 4.0, 0.25, 0.25, 3.0, 0.0, 0.25, 9.0, 0.0, 0.0625)
+    assert state.recent == pytest.approx([short * x for x in recent])
     assert state.baseline == pytest.approx([long * x for x in (1.0, 2.0, -0.5, 0.5, 0.5, 0.0, -2.0)])
     sample = (w, 3.0, 0.0, 0.25, 1.0, 0.5, -0.25, 0.5, 0.0, -2.0)
     assert [row for _, row in state.samples] == [pytest.approx(sample)] * n

@@ -59,6 +59,7 @@ from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierTrack
 from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
 from uavctl.flight.monitors.velocity import CORRECTS_NS
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
 from uavctl.records import ControlMode, Estimate, Order
@@ -70,6 +71,7 @@ ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING, Eve
 # Without positions and inertial data for so long, a plan is not flown on. A gust makes inertial data implausible for a
 # shorter time, and a burst of losses is shorter.
 LOST_NS = 400_000_000
+NEAR_S = 2.0  # time to a limit up to which a wind that may be a wrong response is no reason to fly on
 # Positions that came back so lately after a silence are wrong where two other sources contradict them. Those that never
 # were away may be late by the smoothing of a camera system.
 RETURNED_NS = 4_000_000_000
@@ -86,7 +88,9 @@ _POSITIONS_CONTRADICTED = brake(
     EventCode.PREDICTION_INCONSISTENT,
     "positions contradict both the vehicle's velocity and its inertial data, which change alike",
 )
-_CARRIED_BY_NOTHING = brake(EventCode.PREDICTION_INCONSISTENT, "neither positions nor inertial data come any more")
+_CARRIED_BY_NOTHING = brake(
+    EventCode.PREDICTION_INCONSISTENT, "no position comes, and inertial data do not either, or are doubted"
+)
 _ABSURD_SO_FAR = brake(
     EventCode.POSITIONS_ABSURD,
     "positions are further out than any can be: braking until they are believed again, or not any more",
@@ -348,7 +352,25 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
         return _CONTRADICTED
     is_wrong = change.inertial_wrong_ns is not None or trust.distrusted_ns is not None
     is_lost = is_wrong or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
-    return _CARRIED_BY_NOTHING if is_lost and are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
+    is_wind = inertial.contradict_model_alone(trust) and _are_supported(change, context.at_ns)
+    if not is_lost or (is_wind and not _is_near_limit(view, context)):
+        return NO_VERDICT
+    return _CARRIED_BY_NOTHING if are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
+
+
+def _are_supported(change: VelocityChangeState, at_ns: int) -> bool:
+    """Whether the vehicle's own velocity changes as its inertial data do: what the model does not explain is wind."""
+    has_both = bool(change.samples) and change.samples[-1][2] is not None
+    return has_both and not change.contradicts and change.supports_velocity(at_ns)
+
+
+def _is_near_limit(view: FilterView, context: TickContext) -> bool:
+    """Whether the vehicle reaches a limit within `NEAR_S` by its own velocity: a wrong response may look like wind."""
+    bounds, own = context.controller.envelope, read_vehicle_velocity(context.inputs.motion, context.at_ns)
+    if bounds is None or own is None:
+        return True
+    approaches = outside.list_approaches(observe_motion(view.estimate, context, ZERO), bounds, own)
+    return any(approach.distance_m < NEAR_S * approach.speed_mps for approach in approaches)
 
 
 def are_positions_lost(belief: Belief | None, at_ns: int) -> bool:

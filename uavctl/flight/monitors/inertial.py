@@ -3,7 +3,8 @@
 1. A reading further than 3 σ from the filter's prediction is left out. Three in a row are distrusted.
 2. A position far from where inertial data carried the estimate: they are distrusted.
 3. A velocity that they carried on differs from the vehicle's own, which may be believed: they are distrusted.
-4. Distrust ends with a position that agrees, three seconds later at the earliest.
+4. Distrust ends with a position that agrees, three seconds later at the earliest. Where the model alone was the reason,
+   and the vehicle's own velocity changes as they do, it is wind: then a silence is no reason to brake.
 
 A late sample changes what came after it, so the filter keeps this state in each belief (`uavctl.flight.kalman`).
 
@@ -82,6 +83,11 @@ def _update_distrusted(trust: InertialTrust, since_ns: int, observation: Inertia
     if is_close and observation.at_ns - since_ns >= DISTRUST_NS:
         return InertialTrust(used_ns=trust.used_ns)
     return trust
+
+
+def contradict_model_alone(trust: InertialTrust) -> bool:
+    """Whether inertial data are distrusted, and the model was the reason."""
+    return trust.distrusted_ns is not None and trust.refused >= MOST_REFUSED
 
 
 def _distrust(trust: InertialTrust, at_ns: int) -> tuple[InertialTrust, Verdict]:

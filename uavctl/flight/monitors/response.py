@@ -125,8 +125,9 @@ class ResponseState(msgspec.Struct, frozen=True):
     inertial_ns: int | None = None  # tick of the newest inertial data [ns]; None before any
     velocity: tuple[int, Vec3] | None = None  # the vehicle's own velocity, without inertial data; None before any
     samples: tuple[Sample, ...] = ()  # of the window, oldest first
-    # Sums over samples, where forgotten ones count less: w, w e (3), w e² (3), with e of a right response
-    recent: tuple[float, ...] = (0.0,) * 7
+    # Sums over samples, where forgotten ones count less: w, w e (3), w e² (3), w a (3), w a² (3), with e of a right
+    # response
+    recent: tuple[float, ...] = (0.0,) * 13
     # The same over a longer time: w, w e (3), w v (3)
     baseline: tuple[float, ...] = (0.0,) * 7
 
@@ -223,7 +224,9 @@ def _add_sample(state: ResponseState, shown: _Acceleration, tick: Observation) -
     weight = shown.span_s / CORRELATED_S
     left = [a - u for a, u in zip(shown.accel_mps2, now, strict=True)]
     kept, kept_long = math.exp(-shown.span_s / MEMORY_S), math.exp(-shown.span_s / BASELINE_S)
-    recent, baseline = (1.0, *left, *(e * e for e in left)), (1.0, *left, *velocity)
+    shown_mps2 = shown.accel_mps2
+    recent = (1.0, *left, *(e * e for e in left), *shown_mps2, *(a * a for a in shown_mps2))
+    baseline = (1.0, *left, *velocity)
     sample = shown.middle_ns, (weight, *shown.accel_mps2, *now, *velocity)
     first = bisect_right(state.samples, shown.middle_ns - WINDOW_NS, key=_TIME)
     return replace(
