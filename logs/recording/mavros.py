@@ -33,7 +33,7 @@ _NUMBER_FORMATS = {
 }
 _TIME_FORMATS = {"time": "I", "duration": "i", "builtin_interfaces/Time": "i", "builtin_interfaces/Duration": "i"}
 _FIELD = re.compile(
-    r"^(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?(?P<size>\d{0,10})\])?\s+(?P<name>\w+)(?P<rest>.*)$"
+    r"^(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?(?P<size>\d{0,18})\])?\s+(?P<name>\w+)(?P<rest>.*)$"
 )
 _SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
 _CDR_HEADER_BYTES = 4
