@@ -242,13 +242,15 @@ def round_plan(plan: Plan) -> Plan:
 
 
 def _round(values: Array) -> Array:
-    """Round to `DIGITS` significant digits; what is zero, too small or not finite stays."""
+    """Round to `DIGITS` significant digits; what is zero, too small, not finite or would be infinite stays."""
     size = np.abs(values)
     counts = (size > _MIN_ROUNDED) & (size < np.inf)
     # scale = 10^(digits − 1 − floor(log10 |x|)), rounded = rint(x · scale) / scale
     digits = DIGITS - 1 - np.floor(np.log10(np.where(counts, size, 1.0)))
     up, down = 10.0 ** np.maximum(digits, 0.0), 10.0 ** np.maximum(-digits, 0.0)  # exact powers: no digit is added
-    return np.where(counts, np.rint(values / down * up) / up * down, values)
+    with np.errstate(over="ignore"):
+        rounded = np.rint(values / down * up) / up * down
+    return np.where(counts & np.isfinite(rounded), rounded, values)
 
 
 def are_identical(record: Record, other: Record) -> bool:

