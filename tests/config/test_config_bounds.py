@@ -22,6 +22,9 @@ from uavctl.config.document import (
     MAX_BYTES,
     MAX_DEPTH,
     MAX_LIST_LENGTH,
+    MAX_ROW_LENGTH,
+    MAX_TEXT_LENGTH,
+    MAX_TOKEN_LENGTH,
     MAX_TRAJECTORY_SAMPLES,
     MAX_VALUES,
     DataFileError,
@@ -207,7 +210,7 @@ def test_a_long_file_is_read_up_to_a_bound(tmp_path: Path) -> None:
         ),
         (["0,1,1,-1", "1,1e300,1,-1"], "motion.csv:2: 1e+300 is beyond 1e+07"),
         (["0,1,1,-1", "1e6,1,1,-1"], "times_s: the last one is 1e+06 steps"),
-        (["0,1,1,-1", f"1,{'9' * 100_000},1,-1"], "is not a finite number"),
+        (["0,1,1,-1", f"1,{'9' * 9000},1,-1"], "is not a finite number"),
     ],
 )
 def test_a_motion_from_a_file_is_bounded_as_one_in_the_table(rows: list[str], told: str, tmp_path: Path) -> None:
@@ -381,6 +384,46 @@ def test_rows_beyond_all_bounds_are_not_taken_apart(read: Callable[[Path], objec
     path.write_text("1" + ",1" * 20 + "\n" + ("1" + ",1" * 20 + "\n") * 60_000, encoding="utf-8")
     with limit_memory(8 * path.stat().st_size), pytest.raises(DataFileError, match="has 60001 "):
         read(path)
+
+
+@pytest.mark.parametrize("read", [link._read_delays, mission._read_rows])
+@pytest.mark.parametrize("text", ["x,", "1,", "t[ ", "# t"])
+def test_a_line_longer_than_a_row_is_not_taken_apart(read: Callable[[Path], object], text: str, tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text("\n" + text * 500_000 + "\n0,0,0,0\n", encoding="utf-8")
+    with limit_memory(8 * path.stat().st_size), pytest.raises(DataFileError) as caught:
+        read(path)
+    (reason,) = caught.value.reasons
+    assert reason.startswith(f"{path}:2: ") and f"more than {MAX_ROW_LENGTH}" in reason
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "1" * 1_000_000,
+        "0x" + "f" * 1_000_000,
+        "0." + "1" * 1_000_000,
+        "1_" * 500_000 + "1",
+        '"' + "\\u0041" * 150_000 + '"',
+        '"""' + '"" x' * 250_000 + '"""',
+        '"""' + '\\"' * 500_000,
+        '"' + "a" * 1_000_000,
+        "'" + "a" * 1_000_000 + "'",
+    ],
+    ids=lambda value: value[:6],
+)
+def test_a_long_number_or_text_is_refused_before_memory_is_taken_for_it(value: str) -> None:
+    text = f"name = 'a'\na = {value}\n"
+    with limit_memory(6 * len(text)), pytest.raises(ConfigError) as caught:
+        parse(text, "my.toml", ())
+    (problem,) = caught.value.problems
+    assert problem.startswith("my.toml:2: ") and f"more than {MAX_TOKEN_LENGTH}" in problem
+
+
+@pytest.mark.parametrize("key", ["a" * MAX_TOKEN_LENGTH, '"' + "\\U00000041" * MAX_TEXT_LENGTH + '"'])
+def test_the_longest_token_is_read(key: str) -> None:
+    assert find_excess(f"a = 1 #{'-' * 20_000}\n{' ' * 20_000}{key} = 1 {' ' * 20_000}\n") is None
+    assert find_excess(f"b.{'a' * (MAX_TOKEN_LENGTH + 1)}") == (1, document._describe_long_token("a" * 12_001))
 
 
 def test_a_long_table_name_is_not_kept_for_each_of_its_keys() -> None:

@@ -32,6 +32,7 @@ def motion(tmp_path: Path, text: str) -> tuple[tuple[float, ...], ...]:
         "east_m,north_m,down_m,t_s\n-0.5,0.5,-1,0\n-0.4,0.6,-1.1,1\n",
         "time_ms,north_cm,east_mm,height_m\n0,50,-500,1\n1000,60,-400,1.1\n",
         "t [s],y [m],x [m],z [m]\n0,-0.5,0.5,-1\n1,-0.4,0.6,-1.1\n",
+        "t  ( ms ) ,pos_x  [ m ],pos_y [],pos_z (  )\n0,0.5,-0.5,-1\n1000,0.6,-0.4,-1.1\n",
         "t (ms),pos_x,pos_y,pos_z\n0,0.5,-0.5,-1\n1000,0.6,-0.4,-1.1\n",
         "up,east,north,time\nm,cm,m,s\n1,-50,0.5,0\n1.1,-40,0.6,1\n",
         "# t x y z\n0,0.5,-0.5,-1\n1,0.6,-0.4,-1.1\n",

@@ -26,7 +26,8 @@ TRAJECTORY_UNITS: Mapping[str, Mapping[str, float]] = {
     **dict.fromkeys("xyz", _METRES),
     **dict.fromkeys(("vx", "vy", "vz"), _SPEEDS),
 }
-_NAME = re.compile(r"^(?P<name>[^\[(]*?)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])])?$")
+# No two parts next to each other match the same characters, so that no blank is looked at again and again.
+_NAME = re.compile(r"^(?P<name>[^\[(]*)(?:[\[(](?P<unit>[^\])]*)[\])])?$")
 
 
 class StatedColumn(NamedTuple):
@@ -42,7 +43,7 @@ def parse_heading(cell: str) -> tuple[str, float, str] | None:
     if match is None:
         return None
     words = [word for word in re.split(r"[_\s.\-]+", match["name"]) if word]
-    unit = match["unit"] or ""
+    unit = (match["unit"] or "").strip()
     known_units = (*_SECONDS, *_METRES, *_SPEEDS)
     if not unit and len(words) > 1 and words[-1] in known_units:
         unit = words.pop()

@@ -35,6 +35,8 @@ MAX_DEPTH = 10
 MAX_BYTES = 4_000_000
 MAX_VALUES = 150_000
 MAX_KEY_LENGTH, MAX_TEXT_LENGTH, MAX_LIST_LENGTH = 100, 1000, 20_000
+MAX_TOKEN_LENGTH = 12 * MAX_TEXT_LENGTH  # of one value as it is written: an escape takes up to ten characters
+MAX_ROW_LENGTH = 10_000  # of a line of a file of rows: seven numbers, or a header [characters]
 MAX_INTEGER = 2**63 - 1
 _MAX_REPORTED = 5  # places reported one by one
 
@@ -44,7 +46,9 @@ _MAX_PATH_LENGTH = MAX_DEPTH * (MAX_KEY_LENGTH + 1)  # of a key path that has a 
 # or of the text: a pattern that fails there would begin again at every later quote, and take quadratic time.
 _MARK = re.compile(
     r'''
-    \#[^\n]* | """(?:\\.|[^\\])*?(?:"{3,5}|\\?\Z) | \'\'\'.*?(?:'{3,5}|\Z) | "(?:\\.|[^"\\\n])*"? | '[^'\n]*'?
+    \#[^\n]*
+  | (?P<string>"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\\?\Z) | \'\'\'.*?(?:'{3,5}|\Z)
+             | "(?:\\.|[^"\\\n])*+"? | '[^'\n]*'?)
   | (?P<open>[\[{])
   | (?P<close>[\]}])
   | (?P<dot>\.)
@@ -64,13 +68,18 @@ def find_excess(text: str) -> tuple[int, str] | None:
     values = text.count(",") + text.count("\n")
     if values > MAX_VALUES:
         return 1, f"has more than {MAX_VALUES} lines and commas"
-    depth = dots = 0
+    depth = dots = end = 0
     for match in _MARK.finditer(text):
+        reason = _describe_long_token(match.group()) if match.lastgroup == "string" else ""
+        reason = _describe_long_token(text[end : match.start()]) or reason
+        if reason:
+            return text.count("\n", 0, match.start()) + 1, reason
+        end = match.end()
         depth += (match.lastgroup == "open") - (match.lastgroup == "close")
         if match.lastgroup == "dot":
             dots += 1
             values += dots > 1  # each is a table; a number has one dot at most
-        elif match.lastgroup is not None:  # between strings the same key goes on
+        elif match.lastgroup not in (None, "string"):  # between strings the same key goes on
             dots = 0
         if depth > MAX_DEPTH or dots >= MAX_DEPTH or values > MAX_VALUES:
             line = text.count("\n", 0, match.start()) + 1
@@ -79,7 +88,21 @@ def find_excess(text: str) -> tuple[int, str] | None:
             if values > MAX_VALUES:
                 return line, f"has more than {MAX_VALUES} lines, commas and parts of dotted keys up to here"
             return line, f"a dotted key is nested more than {MAX_DEPTH} deep"
-    return None
+    reason = _describe_long_token(text[end:])
+    return (text.count("\n", 0, end) + 1, reason) if reason else None
+
+
+def _describe_long_token(text: str) -> str:
+    """What is wrong with a string, or with keys and numbers between marks, if one is too long; else empty.
+
+    A parser takes some 150 bytes of memory for each character of a number or a text.
+    """
+    if len(text) <= MAX_TOKEN_LENGTH:
+        return ""
+    length = len(text) if text[0] in "\"'" else max(map(len, text.split()), default=0)
+    if length <= MAX_TOKEN_LENGTH:
+        return ""
+    return f"has a key, number or text of {length} characters; none has more than {MAX_TOKEN_LENGTH}"
 
 
 def find_oversized(table: dict[str, Any]) -> Iterator[ConfigProblem]:
@@ -169,6 +192,24 @@ def read_lines(path: Path) -> list[str]:
     return read_text(path).splitlines()
 
 
+def read_row_lines(path: Path) -> list[str]:
+    """Return the lines of a file of rows, before they are taken apart.
+
+    Raises:
+        DataFileError: As `read_text`, or a line is far longer than a row.
+    """
+    lines = read_lines(path)
+    refuse_file(
+        path,
+        [
+            f"{path}:{number}: has {len(line)} characters, more than {MAX_ROW_LENGTH}; give each row a line of its own"
+            for number, line in enumerate(lines, 1)
+            if len(line) > MAX_ROW_LENGTH
+        ],
+    )
+    return lines
+
+
 def refuse_file(path: Path, reasons: Sequence[str]) -> None:
     """Refuse a file in which something is wrong.
 
@@ -184,7 +225,7 @@ _TOKEN = re.compile(
     r'''
     (?P<skip>[ \t\r]+|\#[^\n]*)
   | (?P<newline>\n)
-  | (?P<string>"""(?:\\.|[^\\])*?"{3,5}|\'\'\'.*?\'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*')
+  | (?P<string>"""(?:[^"\\]|\\.|"(?!""))*+"{3,5}|\'\'\'.*?\'{3,5}|"(?:\\.|[^"\\\n])*+"|'[^'\n]*')
   | (?P<mark>[\[\]{}=,.])
   | (?P<word>[^\s\[\]{}=,.\#"']+)
     ''',

@@ -20,7 +20,7 @@ from uavctl.config.document import (
     Section,
     Spans,
     UnboundedFloats,
-    read_lines,
+    read_row_lines,
     refuse_file,
 )
 
@@ -171,7 +171,7 @@ def read_trace_file(link: LinkConfig, folder: Path, problems: list[ConfigProblem
 
 def _read_delays(path: Path) -> Floats:
     """Delay of each packet [s], infinite for a lost one."""
-    lines = [(number, line) for number, line in enumerate(read_lines(path), 1) if not line.lstrip().startswith("#")]
+    lines = [(number, line) for number, line in enumerate(read_row_lines(path), 1) if not line.lstrip().startswith("#")]
     if len(lines) > MAX_TRACE_PACKETS + 1:  # more, also if the first one names the columns
         raise DataFileError((f"{path}: has {len(lines)} packets, more than {MAX_TRACE_PACKETS}",))
     rows = [(number, line.split(",")) for number, line in lines]

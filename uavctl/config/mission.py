@@ -23,7 +23,7 @@ from uavctl.config.document import (
     Number,
     Position,
     Section,
-    read_lines,
+    read_row_lines,
     refuse_file,
 )
 
@@ -177,7 +177,7 @@ _HEADER_CELL = re.compile(r"(?:[^,\s\[(]|[\[(][^\])]*[\])]?)+")
 def _read_rows(path: Path) -> list[tuple[int, Floats]]:
     """Line number and values of each row, as t, x, y, z and vx, vy, vz in s, m and m/s, all of the same width."""
     lines: list[tuple[int, str]] = []
-    for number, line in enumerate(read_lines(path), 1):
+    for number, line in enumerate(read_row_lines(path), 1):
         text = line.strip()
         if text.startswith("#"):  # a comment, or a header in one
             cells = _HEADER_CELL.findall(text.lstrip("# "))

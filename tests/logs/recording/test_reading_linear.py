@@ -9,7 +9,7 @@ from pathlib import Path
 import hostile_files as files
 import pytest
 from foreign_rig import TLOGS, rows_of, write
-from ulog_writer import UlogWriter
+from ulog_writer import UlogWriter, message
 from work_rig import count_lines
 
 from logs.recording.file_scan import scan_file
@@ -46,6 +46,37 @@ def make_topics(path: Path, size: int) -> None:
     )
 
 
+def make_ros_schemas(path: Path, size: int) -> None:
+    definition = files.MAVLINK_FIELDS + "uint8 incompat_flags\n"
+    topics = (
+        files.schema(n, "pkg/Top", "ros1msg", definition) + files.channel(n, n, f"/t{n}", "ros1")
+        for n in range(2, size)
+    )
+    path.write_bytes(
+        files.MAGIC + files.channel(1, 0, "/mavlink", "") + files.message(1, FRAME, 10**18) + b"".join(topics)
+    )
+
+
+def make_formats(path: Path, size: int) -> None:
+    log = UlogWriter(1)
+    log.data(log.topic("first", ["float x"]), 1, 1.0)
+    log_bytes = log.file
+    at = log.definitions_bytes
+    formats = (message("F", f"format{number}:uint64_t timestamp;float a;".encode()) for number in range(size))
+    path.write_bytes(log_bytes[:at] + b"".join(formats) + log_bytes[at:])
+
+
+def make_subscriptions(path: Path, size: int) -> None:
+    log = UlogWriter(1)
+    log.data(log.topic("first", ["float x"]), 1, 1.0)
+    more = (
+        message("A", struct.pack("<BH", number % 200, 3 + number) + b"first")
+        + message("D", struct.pack("<HQf", 3 + number, 10_000 * number, 1.0))
+        for number in range(size)
+    )
+    path.write_bytes(log.file + b"".join(more))
+
+
 def make_toml(path: Path, size: int) -> None:
     path.write_text("".join(f"[table{number}]\nkey = [1, 2, 3]\n" for number in range(size)))
 
@@ -69,8 +100,11 @@ def read_trajectory(path: Path) -> None:
 READERS: dict[str, tuple[Callable[[Path, int], None], Callable[[Path], object]]] = {
     "tlog": (make_tlog, read_tlog),
     "ULog": (make_ulog, read_ulog),
+    "ULog, formats": (make_formats, read_ulog),
+    "ULog, subscriptions": (make_subscriptions, read_ulog),
     "MCAP, many frames": (make_frames, read_mcap),
     "MCAP, many topics": (make_topics, read_mcap),
+    "MCAP, definitions of ROS": (make_ros_schemas, read_mcap),
     "MCAP, chunks": (make_frames, lambda path: list(scan_file(path))),
     "TOML": (make_toml, read_toml),
     "CSV": (make_trajectory, read_trajectory),
