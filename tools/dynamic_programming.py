@@ -127,7 +127,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--loss", type=float, default=0.3, help="share of independent losses")
     parser.add_argument("--prices", type=float, nargs="+", default=[100.0, 130.0, 160.0], help="λ of a step outside")
-    parser.add_argument("--ages", type=int, default=13, help="oldest age that is told apart [steps]")
+    parser.add_argument("--ages", type=int, default=13, help="oldest age that has values of its own [steps]")
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--steps", type=int, default=2200)
     parser.add_argument("--seed", type=int, default=9700)

@@ -32,6 +32,7 @@ _NUMBER_FORMATS = {
     "float64": "d",
 }
 _TIME_FORMATS = {"time": "I", "duration": "i", "builtin_interfaces/Time": "i", "builtin_interfaces/Duration": "i"}
+# An array has at most 18 digits: Python refuses to read thousands, and no message is that long.
 _FIELD = re.compile(
     r"^(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?(?P<size>\d{0,18})\])?\s+(?P<name>\w+)(?P<rest>.*)$"
 )

@@ -495,7 +495,7 @@ def swing(late_s: float) -> list[TickOutput]:
     controller = replace(controller_that_feels(bias_max=3.0, bias_drift=3.0), envelope=envelope)
     # a = A cos(ω t), v = A/ω sin(ω t), p = A/ω² (1 - cos(ω t))
     omega, accel_mps2 = 2.0, 2.0
-    state, told = make_initial_state(), []
+    state, outputs = make_initial_state(), []
     for tick in range(3 * 20):
         at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
         shown_s = s - (late_s if s >= 2.0 else 0.0)
@@ -513,17 +513,17 @@ def swing(late_s: float) -> list[TickOutput]:
             engaged = state.monitors.engaged
             engaged = msgspec.structs.replace(engaged, motion=msgspec.structs.replace(engaged.motion, resumed_ns=at_ns))
             state = msgspec.structs.replace(state, monitors=msgspec.structs.replace(state.monitors, engaged=engaged))
-        told.append(one)
-    return told
+        outputs.append(one)
+    return outputs
 
 
 @pytest.mark.fault(94)
 def test_positions_are_wrong_where_inertial_data_and_the_vehicle_s_own_velocity_change_alike() -> None:
     braked = {}
     for late_s in (0.0, 0.3):
-        told = swing(late_s)
-        braked[late_s] = [0.05 * tick for tick, one in enumerate(told) if one.decision.mode == "brake"]
-        assert not any(event.code == EventCode.INERTIAL_DOUBTED for one in told for event in one.events)
+        outputs = swing(late_s)
+        braked[late_s] = [0.05 * tick for tick, one in enumerate(outputs) if one.decision.mode == "brake"]
+        assert not any(event.code == EventCode.INERTIAL_DOUBTED for one in outputs for event in one.events)
     assert not braked[0.0]
     assert 2.0 < min(braked[0.3]) < 2.5
 
@@ -538,7 +538,7 @@ def blow(*, moves: bool = True, has_velocity: bool = True, left_m: float = 9.0) 
     """
     envelope = replace(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3, upper_m=(left_m, 9.0, 9.0))
     controller = replace(controller_that_feels(), envelope=envelope)
-    state, told = make_initial_state(), []
+    state, outputs = make_initial_state(), []
     for tick in range(3 * 20):
         at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
         blown_s = max(s - 2.0, 0.0)
@@ -555,15 +555,15 @@ def blow(*, moves: bool = True, has_velocity: bool = True, left_m: float = 9.0) 
             inertial=felt_at(at_ns - MS, accel_mps2),
         )
         state, one = run_tick(state, given, controller)
-        told.append(one)
-    return told
+        outputs.append(one)
+    return outputs
 
 
 @pytest.mark.fault(71)
 def test_a_wind_is_no_reason_to_brake_in_a_silence_where_the_vehicle_s_own_velocity_shows_it_too() -> None:
-    told = blow()
-    assert any(event.code == EventCode.INERTIAL_DOUBTED for one in told for event in one.events)
-    assert all(one.decision.mode == "track" for one in told[2:])
+    outputs = blow()
+    assert any(event.code == EventCode.INERTIAL_DOUBTED for one in outputs for event in one.events)
+    assert all(one.decision.mode == "track" for one in outputs[2:])
 
 
 @pytest.mark.fault(59)
@@ -573,8 +573,8 @@ def test_a_wind_is_no_reason_to_brake_in_a_silence_where_the_vehicle_s_own_veloc
 def test_it_brakes_where_that_may_be_a_lie_or_a_wrong_response_before_a_limit(
     moves: bool, has_velocity: bool, left_m: float
 ) -> None:
-    told = blow(moves=moves, has_velocity=has_velocity, left_m=left_m)
-    assert any(one.decision.mode == "brake" for one in told)
+    outputs = blow(moves=moves, has_velocity=has_velocity, left_m=left_m)
+    assert any(one.decision.mode == "brake" for one in outputs)
 
 
 def test_a_fallback_that_ends_holds_by_nothing() -> None:
@@ -589,8 +589,10 @@ def test_a_fallback_that_ends_holds_by_nothing() -> None:
     assert find_return_accel(ended, origin, view, plant) == (0.0, 0.0, 0.0)
     recover, point = Fallback(ControlMode.HOLD, START_NS), (1.0, 0.0, 0.0)
     assert find_return_accel(recover, point, view, plant)[0] > 0.5
-    told = update_inertial(kalman, history, felt_at(START_NS + TICK_NS, 50.0))  # cannot be, and so carries nothing on
-    lied = msgspec.structs.replace(view, belief=predict_belief(kalman, told, START_NS + 300 * MS))
+    outputs = update_inertial(
+        kalman, history, felt_at(START_NS + TICK_NS, 50.0)
+    )  # cannot be, and so carries nothing on
+    lied = msgspec.structs.replace(view, belief=predict_belief(kalman, outputs, START_NS + 300 * MS))
     assert find_return_accel(recover, point, lied, plant) == (0.0, 0.0, 0.0)
     later = msgspec.structs.replace(view, belief=predict_belief(kalman, history, START_NS + 300 * MS))
     assert find_return_accel(recover, point, later, plant) == (0.0, 0.0, 0.0)  # the data are too old

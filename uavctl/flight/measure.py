@@ -312,7 +312,9 @@ def _judge_sample(
             return sources, NO_VERDICT
         corrected = _correct_sample(sources, sample, at_ns)
         if at_ns > (history.captured_ns or at_ns):
-            sources = replace(sources, spread=_count_innovation(kalman, sources.spread, corrected, belief))
+            sources = replace(
+                sources, spread=_count_innovation(kalman, sources.spread, offset[:n_axes], corrected, belief)
+            )
         return _judge_jump(kalman, sources, offset, corrected, belief)
     if frozen.is_repeat(tracks[sample.source], at_ns):
         # A repeated value did not jump: the prediction has moved away from a source that is frozen.
@@ -320,16 +322,14 @@ def _judge_sample(
     return replace(sources, outliers=outlier_track), verdict
 
 
-def _count_innovation(kalman: Kalman, spread: SpreadState, corrected: PositionSample, belief: Belief) -> SpreadState:
-    """Count the innovation of a position for the spread."""
-    values, variances = read_measurement(kalman, corrected)
-    index = kalman.measured_index[: len(kalman.axes)]
-    # ν = y - H z,  s² = P + R
-    innovations, expected = (
-        values[: len(index)] - belief.mean[index],
-        belief.cov[index, index] + variances[: len(index)],
-    )
-    return count_innovation(spread, innovations.tolist(), expected.tolist())
+def _count_innovation(
+    kalman: Kalman, spread: SpreadState, innovations: Array, corrected: PositionSample, belief: Belief
+) -> SpreadState:
+    """Count the innovations (n_axes,) of a position for the spread."""
+    index = kalman.measured_index[: len(innovations)]
+    # s² = P + R
+    variances = belief.cov[index, index] + read_measurement(kalman, corrected)[1][: len(index)]
+    return count_innovation(spread, innovations.tolist(), variances.tolist())
 
 
 def _correct_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -> PositionSample:

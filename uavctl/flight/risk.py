@@ -153,7 +153,7 @@ def _make_record(
 
 
 def report_saturation(before: RiskGroup, now: RiskGroup, context: TickContext) -> tuple[Event, ...]:
-    """Report where the spread begins to be at its largest value."""
+    """Report where the loop's factor begins to be at its largest value."""
     parameters = context.controller.risk
     if parameters is None or not parameters.adapts or before.loop.is_saturated or not now.loop.is_saturated:
         return ()

@@ -17,7 +17,7 @@ class RiskParameters:
     choice: BudgetChoice  # budgets to choose from
     rows: Array  # state rows C (m, n_x)
     budgets: str  # `certificate`, or `observed`: they follow the link
-    adapts: bool  # whether the spread follows the risk as observed
+    adapts: bool  # whether the deviations follow the risk as observed
 
 
 class RiskGroup(msgspec.Struct, frozen=True):

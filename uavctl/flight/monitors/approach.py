@@ -5,7 +5,7 @@
 2. The vehicle is within two seconds of a limit, or beyond it. Setpoints ask for a deceleration of 0.5 m/s² or more, and
    less than a quarter of it comes, for 0.1 s; or the vehicle gains 0.3 m/s² towards the limit, steady wind or not.
    Then: end the plans. The vehicle's own landing brakes without setpoints.
-3. A wind that sets in is told from a response that is dead by changes: where setpoints leave less than half of the
+3. Changes distinguish a wind that sets in from a response that is dead: where setpoints leave less than half of the
    variance of the acceleration, over the last half second, they are answered. What they leave in the mean is the wind,
    for three seconds, if it blows to the limit by 0.45 m/s² more than before. While they are answered, a gain is wind.
 
@@ -46,7 +46,7 @@ class ApproachState(msgspec.Struct, frozen=True):
     """State of the monitor."""
 
     since_ns: int | None = None  # since when setpoints have not slowed the vehicle down [ns]; None while they do
-    # Of each axis, when setpoints were last seen to be answered [ns], and the wind beside them then [m/s²]; None before
+    # Of each axis, when setpoints were last seen to be answered [ns], and the wind in addition [m/s²]; None before
     winds: tuple[tuple[int, float] | None, ...] = (None, None, None)
 
 
