@@ -51,6 +51,6 @@ def test_a_slow_approach_with_a_dead_response_ends_near_the_limit(
     config = load_config(preset, [f"sim.autopilot={autopilot}", *choose_plant(plant, 3.0), *mission, *flown])
     believed = prepare_believed(preset, autopilot, mission)
     flight = fly_deceived(config, *believed, [Deception("response", "dead", dead_s)], None)
-    # Up to 0.68 m in 24 flights with other seeds, as before winds were learned.
-    assert flight.outside_m <= OUTSIDE_M
+    # The linear PX4 vehicle goes 0.54 m: it no longer brakes before the fault, as a steady wind is no reason to.
+    assert flight.outside_m <= 0.6
     assert flight.codes is not None and EventCode.SETPOINT_RESPONSE in flight.codes
