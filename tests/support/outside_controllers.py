@@ -12,12 +12,12 @@ from uavctl.smpc.outside import PlanRequest
 
 
 class Regulates:
-    """The regulator of `[cost]`, one input at a time."""
+    """A calm regulator, one input at a time."""
 
     fails_at = 10**9  # step
 
     def __init__(self, problem: ControlProblem) -> None:
-        self.k = lqr(problem.plant, problem.q_x, problem.q_u).k
+        self.k = lqr(problem.plant, np.diag([10.0, 1.0, 0.1] * problem.plant.n_u), np.eye(problem.plant.n_u)).k
 
     def plan(self, request: PlanRequest) -> Any:
         """See `FlightPlanner`."""
