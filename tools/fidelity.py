@@ -24,7 +24,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import read_tlog
 from sim.simulation import Peers
-from uavctl.build.controller import build_controller, build_flight_design
 from uavctl.config import Config, load_config
 from uavctl.errors import UavctlError
 from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
@@ -34,6 +33,7 @@ from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Datagram, Order, Record
+from uavctl.wiring.controller import build_controller, build_flight_design
 
 DOCS = Path(__file__).parents[1] / "docs" / "autopilots.md"
 BEGIN, END = "<!-- fidelity: written by tools/fidelity.py -->\n", "<!-- end of fidelity -->\n"

@@ -3,8 +3,10 @@
 1. `mean-qp`: a plan from each new position, played out in silence. Stage t keeps min(κ σ_t, cap) from the limits, and
    the plan aims at a reference further from the wall than the target. The cap is the reference's distance.
 2. `lqr`: the regulator on the predicted mean, aimed at such a reference and clipped by the actuators.
+3. `lqr-by-age`: the same with a reference that is further away the older the information is. How the distances differ
+   follows from the ages of the link that they are tuned on, see `tools/reference_by_age.py`.
 
-Both are judged by the cost to the target, as the scheme is. The reference is the nearest to the wall that is outside in
+All are judged by the cost to the target, as the scheme is. The reference is the nearest to the wall that is outside in
 at most `--outside` of the steps after the first 200, found by halving on runs of another seed: on the link itself, and
 on the link of 30 % independent losses. It prints, for each link, the reference, share outside and cost of a step.
 
@@ -19,16 +21,18 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from other_links import ALLOWED, CELLS, SETTLED, WALL_M, Cell, draw_run, make_problem
+from other_links import ALLOWED, CELLS, HORIZON, SETTLED, WALL_M, Cell, draw_run, make_problem
+from reference_by_age import find_distances
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.world import LinearWorld, simulate
 from uavctl.smpc.baselines import Lqg, PacketisedPredictive
-from uavctl.smpc.batch import BatchController, Counts
+from uavctl.smpc.batch import BatchController, Counts, Information, predict
 from uavctl.smpc.nominal import BatchMpc, ControlProblem, propagate_covariance, row_deviations
 
 NEAREST_M, FURTHEST_M, HALVINGS = 0.5, 60.0, 8
 TUNING_SEED, TUNING_RUNS = 77, 12
+KINDS = "mean-qp", "lqr", "lqr-by-age"
 DESIGN = Cell("30%")  # 30 % independent losses
 
 
@@ -47,8 +51,39 @@ class CappedMeanQp(PacketisedPredictive):
         return BatchMpc(problem, np.minimum(backoffs, self._cap_m))
 
 
-def make_controller(kind: str, kappa: float, problem: ControlProblem, distance_m: float) -> BatchController:
+class LqrByAge(Lqg):
+    """LQR whose reference follows the age; `shape` (n,) has the distances of the ages, the largest of them 1."""
+
+    def __init__(self, problem: ControlProblem, shape: Array, distance_m: float) -> None:
+        super().__init__(problem)
+        self._distances_m = distance_m * shape
+
+    def act(self, information: Information) -> Array:
+        """See `BatchController`."""
+        distances_m = self._distances_m[np.minimum(information.age, self._distances_m.size - 1)]
+        deviation = predict(self._problem.plant, information)
+        deviation[:, ::2] -= (WALL_M - distances_m)[:, None]
+        return np.asarray(deviation @ self._k.T)
+
+
+def find_shape(problem: ControlProblem, newest: Counts) -> Array:
+    """Find the distances of the ages (n,) on a link as drawn, the largest of them 1."""
+    ages = np.minimum(np.arange(newest.shape[1]) - newest[:, :], HORIZON - 1)[:, SETTLED:]
+    shares = np.bincount(ages.ravel(), minlength=HORIZON).astype(float)
+    # A position that is late is never young; from the most frequent age on, shares fall
+    youngest = int(shares.argmax())
+    shares = np.minimum.accumulate(shares[youngest:])
+    (row,) = np.flatnonzero(problem.state_set.c[:, 0] > 0.0)
+    distances = find_distances(make_problem(1), np.maximum(shares, 1e-12), int(row), ALLOWED)
+    return np.concatenate([np.full(youngest, distances[0]), distances]) / distances.max()
+
+
+def make_controller(
+    kind: str, kappa: float, problem: ControlProblem, distance_m: float, shape: Array
+) -> BatchController:
     """Make a controller whose reference is at a distance from each wall."""
+    if kind == "lqr-by-age":
+        return LqrByAge(problem, shape, distance_m)
     target = problem.target.copy()
     target[::2] = WALL_M - distance_m
     moved = replace(problem, target=target)
@@ -86,15 +121,22 @@ def fly(
     return outside[:, :SETTLED].mean(axis=1), outside[:, SETTLED:].mean(axis=1), flown.cost[:, SETTLED:].mean(axis=1)
 
 
-def find_reference(kind: str, kappa: float, problem: ControlProblem, cell: Cell, steps: int, allowed: float) -> float:
-    """Return the reference's least distance [m] with no more than the allowed share of settled steps outside."""
+def find_reference(
+    kind: str, kappa: float, problem: ControlProblem, cell: Cell, steps: int, allowed: float
+) -> tuple[float, Array]:
+    """Return the reference's least distance [m] with no more than the allowed share of settled steps outside.
+
+    Returns:
+        The distance, and how the ages share it, see `find_shape`.
+    """
     drawn = draw_runs(cell, problem, steps, TUNING_SEED, TUNING_RUNS)
+    shape = find_shape(problem, drawn[0])
     low, high = NEAREST_M, FURTHEST_M
     for _ in range(HALVINGS):
         middle = math.sqrt(low * high)
-        _, outside, _ = fly(make_controller(kind, kappa, problem, middle), problem, drawn)
+        _, outside, _ = fly(make_controller(kind, kappa, problem, middle, shape), problem, drawn)
         low, high = (low, middle) if outside.mean() <= allowed else (middle, high)
-    return high
+    return high, shape
 
 
 def main() -> None:
@@ -111,16 +153,13 @@ def main() -> None:
     problem = make_problem(given.axes)
     sys.stdout.write(f"| cell | controller, tuned on | reference | first {SETTLED} steps outside | after | cost |\n")
     sys.stdout.write("|---|---|---|---|---|---|\n")
-    fixed = {
-        kind: find_reference(kind, given.kappa, problem, DESIGN, given.steps, given.outside)
-        for kind in ("mean-qp", "lqr")
-    }
+    fixed = {kind: find_reference(kind, given.kappa, problem, DESIGN, given.steps, given.outside) for kind in KINDS}
     for cell in (cell for cell in CELLS if given.cells in cell.name):
         drawn = draw_runs(cell, problem, given.steps, given.seed, given.runs)
-        for kind, design_m in fixed.items():
-            own_m = find_reference(kind, given.kappa, problem, cell, given.steps, given.outside)
-            for name, distance_m in (("this link", own_m), ("30 %", design_m)):
-                early, late, cost = fly(make_controller(kind, given.kappa, problem, distance_m), problem, drawn)
+        for kind, designed in fixed.items():
+            own = find_reference(kind, given.kappa, problem, cell, given.steps, given.outside)
+            for name, (distance_m, shape) in (("this link", own), ("30 %", designed)):
+                early, late, cost = fly(make_controller(kind, given.kappa, problem, distance_m, shape), problem, drawn)
                 half = 1.96 / math.sqrt(given.runs)
                 sys.stdout.write(
                     f"| {cell.name} | {kind}, {name} | {distance_m:.2f} m | {early.mean():.1%} | {late.mean():.1%} ± "

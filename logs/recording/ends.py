@@ -15,11 +15,11 @@ from logs.recording.output_files import remove_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER
 from uavctl.account import report_failed_writes, report_lost_records
-from uavctl.build.controller import Prepared, collect_versions, make_design_record, read_cpu_model
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
 from uavctl.config.types import LogConfig
 from uavctl.records import Ending, Header, Sink
+from uavctl.wiring.controller import Prepared, collect_versions, make_design_record, read_cpu_model
 
 
 def make_recording_path(out: Path | None, name: str) -> Path:

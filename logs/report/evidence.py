@@ -15,9 +15,9 @@ from logs.recording.summary import BLIND_S, FlightSummary
 from logs.report.excursion import Clearance, Excursion, find_excursions
 from logs.report.verdicts import Judgement, read_flown_config
 from uavctl.arrays import Array
-from uavctl.build.controller import build_estimator
 from uavctl.config import Config
 from uavctl.records import Decision, LinkStats
+from uavctl.wiring.controller import build_estimator
 
 _PUSH_MPS2, _PUSH_MPS = 0.1, 0.3  # carries a vehicle off by as much as is worth telling, if it lasts
 _MIN_OBSERVATION_S, _MAX_EXIT_DELAY_S = (

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from logs.recording.flight import FLOWN, FlightData
 from uavctl.arrays import Array
-from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import Config
 from uavctl.flight.context import describe_not_ready
 from uavctl.flight.kalman import (
@@ -30,6 +29,7 @@ from uavctl.flight.kalman import (
     update_with_position,
 )
 from uavctl.records import PositionSample
+from uavctl.wiring.controller import build_estimator, build_plant
 
 # Positions that are looked at, the first of the flight: enough to find a deviation that is 3 % wrong.
 MAX_POSITIONS = 20_000

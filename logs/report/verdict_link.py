@@ -12,11 +12,11 @@ from logs.recording.flight import FlightData
 from logs.recording.summary import count
 from logs.report.statistics import Share, autocorrelation, estimate_share, two_sided_quantile
 from uavctl.arrays import Array
-from uavctl.build.link import build_ages, build_delayed_link, compute_promised_probability
 from uavctl.config import Config
 from uavctl.errors import DesignError
 from uavctl.event_codes import EventCode
 from uavctl.flight.link_estimate import NO_COUNTS, LinkEstimateParameters, compute_burst_statistic, count_step
+from uavctl.wiring.link import build_ages, build_delayed_link, compute_promised_probability
 
 # Steps after which the age has forgotten where it began, for any link that a design is made for.
 _STATIONARY_STEPS = 120

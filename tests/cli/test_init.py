@@ -8,13 +8,13 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from uavctl.build.controller import build_flight_design
 from uavctl.cli.app import run
 from uavctl.cli.init import WALL_M, format_room, parse_sizes
 from uavctl.cli.sim import DEFAULT_VEHICLE_URLS
 from uavctl.config import dump_config, load, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.errors import ConfigError, UsageError
+from uavctl.wiring.controller import build_flight_design
 
 
 def write_room(autopilot: str, room: str = "6x5x2.5") -> str:

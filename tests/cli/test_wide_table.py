@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from rich.console import Console, Group, RenderableType
 
-from uavctl.build.controller import build_design
 from uavctl.cli.common import DEFAULTS, Column, WideTable, make_pair_table, make_table
 from uavctl.cli.design import _make_column, make_plan_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.wiring.controller import build_design
 
 
 def print_table(renderable: RenderableType, width: int) -> list[str]:

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import ROOT
 
-from uavctl.build.controller import build_spec
 from uavctl.config import Config, describe_design_error, dump_config, load, load_config, parse, presets
 from uavctl.config.document import find_key_lines
 from uavctl.config.load import parse_recorded
 from uavctl.config.mission import FenceConfig
 from uavctl.config.types import SmpcConfig
 from uavctl.errors import ConfigError, DesignError
+from uavctl.wiring.controller import build_spec
 
 PAPER = (ROOT / "uavctl" / "presets" / "paper.toml").read_text(encoding="utf-8")
 

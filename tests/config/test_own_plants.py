@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import uavctl
-from uavctl.build.controller import build_controller, build_problem
 from uavctl.config import dump_config, load, parse
 from uavctl.errors import ConfigError, DesignError
 from uavctl.records import SolveStatus
+from uavctl.wiring.controller import build_controller, build_problem
 
 ONE = ("a = [[0.9]]\nb = [[0.1]]\ne = [[0.1]]\ndt_s = 1.0", 1, 1)
 ONE_BY_TWO = ("a = [[0.9]]\nb = [[0.1, 0.2]]\ne = [[0.1]]\ndt_s = 1.0", 1, 2)

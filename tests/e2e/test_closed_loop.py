@@ -12,10 +12,10 @@ from loopback_rig import MemorySink, flight, lockstep, make_loop
 from logs.recording.flight import FlightData
 from logs.recording.replay import replay
 from logs.recording.summary import summarise
-from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.records import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SetpointSource, SolveStatus, Truth
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+from uavctl.wiring.controller import build_design
 
 LONG = range(4)  # seeds of flights of 200 steps
 

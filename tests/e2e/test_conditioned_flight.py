@@ -10,7 +10,6 @@ import pytest
 from loopback_rig import MemorySink, lockstep, make_loop
 
 from logs.recording.replay import replay
-from uavctl.build.controller import build_conditioned, build_design, compute_reference_limits
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.lab.campaign.controllers import build_from_recipe, draw_conditions
@@ -19,6 +18,7 @@ from uavctl.lab.campaign.tasks import describe_cell, make_cells
 from uavctl.lab.campaign.world import simulate
 from uavctl.records import ControlMode, Decision, Plan, Setpoint, SolveStatus, Truth
 from uavctl.smpc.conditioned.planner import METHOD
+from uavctl.wiring.controller import build_conditioned, build_design, compute_reference_limits
 
 SCHEME = "smpc.scheme=age-conditioned"
 FENCE = 'fence=[{state="north",side="upper",times_s=[6,14],values=[3.0,1.2]}]'

@@ -47,7 +47,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made_or_sent(
     arguments: list[str],
     message: str,
 ) -> None:
-    monkeypatch.delattr("uavctl.build.controller.build_solver")
+    monkeypatch.delattr("uavctl.wiring.controller.build_solver")
     code, out, err = run_loopback(capsys, command, *arguments, "--out", str(tmp_path / "flight"))
     assert code == 2 and message in err and not out
     assert not list(tmp_path.rglob("*.mcap"))

@@ -13,7 +13,6 @@ import pytest
 from mavlink_rig import MS, NO_COVARIANCE, OFFBOARD, SECOND, Peer, events, make_link, packets, read, samples, statuses
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.build.controller import build_estimator
 from uavctl.config import load_config
 from uavctl.config.connections import SourceConfig
 from uavctl.flight.measure import find_refusal
@@ -26,6 +25,7 @@ from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.mavlink.handover_states import HandoverState, SetpointMode
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import PositionSample, Setpoint, SetpointSource, Severity
+from uavctl.wiring.controller import build_estimator
 
 NOW = 50_000 * SECOND
 CAMERA = Peer(17, 18)

@@ -23,11 +23,11 @@ from logs.recording.reader import find_segments, read, read_kind
 from logs.recording.recorder import Recorder, SyncRecorder
 from logs.recording.recover import recover
 from sim.simulation import World
-from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
 from uavctl.records import Event, Record, Severity
+from uavctl.wiring.controller import build_design
 
 COUNT = 60
 TOOL = ROOT / "tools" / "storage.py"

@@ -9,9 +9,9 @@ from msgspec.structs import replace
 from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_true
 from soak_rig import prepare_room
 
-from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
+from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
 # The swap of two axes looks like the right ones along their diagonal, and the mission of the preset leads along it; it
 # is found because one axis leads.

@@ -31,13 +31,13 @@ from logs.report.headline import derive_headline
 from logs.report.summary_text import describe_flight
 from logs.report.verdicts import judge_flight
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design
 from uavctl.cause import Cause
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.mission import Waypoint
 from uavctl.records import ControlMode, Decision, Event, GaveWay, Plan, Truth
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
+from uavctl.wiring.controller import build_design
 
 PLACES_M = ((1.5, 1.0, -1.2), (-1.0, 1.2, -0.9), (0.0, -1.0, -1.5))
 HOLD_S, ACCEPT_M = 2.0, 0.3

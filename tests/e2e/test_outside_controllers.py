@@ -14,11 +14,11 @@ from soak_pairs import SPEED_MPS, WORLDS, compute_outside_m
 from soak_rig import LoopWatch, fly
 
 from sim.simulation import World
-from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.cause import Cause
 from uavctl.cli.app import run
 from uavctl.config import Config, load_config
 from uavctl.records import ControlMode, Ending
+from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
 MODULE = "outside_controllers"
 OWN_PARTS = Path(__file__).parents[2] / "docs" / "examples" / "own-parts"

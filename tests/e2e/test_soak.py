@@ -19,9 +19,9 @@ from soak_take_off import fly_take_off, judge_outcome, tally_take_offs
 from take_off_rig import RELAYED, TakeOffRig
 
 from logs.recording.reader import read
-from uavctl.build.controller import Prepared
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Truth, Vec3
+from uavctl.wiring.controller import Prepared
 
 TOOL = ROOT / "tools" / "soak.py"
 

@@ -12,7 +12,6 @@ from recorded_rig import packets
 
 from sim.simulation import World
 from sim.vehicle.quadrotor import Quadrotor
-from uavctl.build.controller import build_envelope, build_plant
 from uavctl.config import load_config
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
@@ -25,6 +24,7 @@ from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE, make_links
 from uavctl.mavlink.framing import scan_frames
 from uavctl.records import Event, InertialSample, Outgoing, PositionSample, Record, Send, Vec3, VehicleMotion
+from uavctl.wiring.controller import build_envelope, build_plant
 
 MODEL_DRAG_1PS, DRAG_1PS = 0.24, 1.0  # of the simulated Crazyflie, and of PX4's own simulated vehicle
 BEGINS_S, OVER_S = 5.0, 16.0

@@ -15,7 +15,6 @@ from turned_poses_rig import TurnedPosesFlight
 from logs.recording.reader import read_kind
 from sim.simulation import World
 from sim.vehicle.interface import compute_heading_rad
-from uavctl.build.controller import build_flight_design, prepare
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
@@ -23,6 +22,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.supervise import ENVELOPE_CODES
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import ControlMode, Event, Setpoint, Vec3
+from uavctl.wiring.controller import build_flight_design, prepare
 
 GUSTS = ("sim.plant=quadrotor", "sim.seed=4", "sim.wind.velocity_mps=[0.6,0.4,0.0]", "sim.wind.gust_wind_mps=3.0")
 # ArduPilot's nose follows its velocity where no yaw is sent.

@@ -31,7 +31,6 @@ from msgspec import structs
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from uavctl.build.controller import build_controller, build_design, build_spec
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
 from uavctl.event_codes import EventCode
@@ -43,6 +42,7 @@ from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, PositionSample, StepInput, VehicleMotion
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.estimate import add_bias, innovation_form
+from uavctl.wiring.controller import build_controller, build_design, build_spec
 
 Array = NDArray[np.float64]
 

@@ -6,11 +6,11 @@ import numpy as np
 from flight_rig import MS, START_NS, run, sample, vehicle
 from numpy.typing import NDArray
 
-from uavctl.build.controller import build_controller
 from uavctl.config import load_config
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, SolveStatus, StepInput
+from uavctl.wiring.controller import build_controller
 
 
 def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[TickOutput], NDArray[np.float64]]:

@@ -31,7 +31,6 @@ from flight_rig import (
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import load_config
 from uavctl.event_codes import EventCode
 from uavctl.flight.act import find_return_accel
@@ -68,6 +67,7 @@ from uavctl.flight.state import ControlState
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
+from uavctl.wiring.controller import build_estimator, build_plant
 
 Array = NDArray[np.float64]
 

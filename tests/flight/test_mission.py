@@ -10,8 +10,6 @@ import pytest
 from flight_rig import make_rest_region, small_plant
 from numpy.typing import NDArray
 
-from uavctl.build.controller import build_controller, build_design
-from uavctl.build.mission import build_mission, build_reference_limits, build_trajectory
 from uavctl.config import load_config
 from uavctl.config.types import Config
 from uavctl.constraint_names import describe_all_relaxed, describe_relaxed, name_constraints
@@ -34,6 +32,8 @@ from uavctl.flight.mission import (
 )
 from uavctl.records import GaveWay, Vec3
 from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.wiring.controller import build_controller, build_design
+from uavctl.wiring.mission import build_mission, build_reference_limits, build_trajectory
 
 Array = NDArray[np.float64]
 

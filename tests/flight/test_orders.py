@@ -25,13 +25,13 @@ from flight_rig import (
     vehicle,
 )
 
-from uavctl.build.controller import build_controller
 from uavctl.config import load_config
 from uavctl.event_codes import EventCode
 from uavctl.flight.controller import Controller
 from uavctl.flight.mission import Waypoint
 from uavctl.flight.tick import TickOutput
 from uavctl.records import Command, ControlMode, Order, Severity, Vec3, VehicleStatus
+from uavctl.wiring.controller import build_controller
 
 WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = ControlMode
 STAY, RESUME, DOWN, ENGAGE = (Command(order=order) for order in (Order.HOLD, Order.RESUME, Order.LAND, Order.ENGAGE))

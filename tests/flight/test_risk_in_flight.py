@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from flight_rig import MS, START_NS, run, sample, vehicle
 
-from uavctl.build.controller import build_conditioned, build_controller
 from uavctl.config.load import dump_config, load_config, parse_recorded
 from uavctl.config.types import Config
 from uavctl.event_codes import EventCode
@@ -20,6 +19,7 @@ from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import Plan, RiskRecord, StepInput, Vec3
 from uavctl.smpc.conditioned.adaptation import MAX_WIDENING, AgeRecord, LoopState, charge_risk, count_age
+from uavctl.wiring.controller import build_conditioned, build_controller
 
 STEPS = 300
 WALL_M = 3.0

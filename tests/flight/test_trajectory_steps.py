@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from uavctl.build.controller import build_controller, build_plant
 from uavctl.config import Config, load_config
 from uavctl.flight.mission import MissionState, find_target, make_question
 from uavctl.flight.trajectory import follow_positions, plan_along
+from uavctl.wiring.controller import build_controller, build_plant
 
 Array = NDArray[np.float64]
 

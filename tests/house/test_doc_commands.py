@@ -10,9 +10,9 @@ import sys
 import pytest
 from places import ROOT
 
-from uavctl.build.controller import build_design
 from uavctl.cli.app import app
 from uavctl.cli.common import Common
+from uavctl.wiring.controller import build_design
 
 
 def find_loopbacks() -> list[str]:

@@ -12,8 +12,6 @@ from scipy.stats import binomtest, fisher_exact
 
 from sim.simulation import World
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned, build_controller, build_estimator, build_plant
-from uavctl.build.rehearsal import make_rehearsal_start
 from uavctl.cli.app import run
 from uavctl.cli.check import make_flight_items
 from uavctl.config import Config, load_config
@@ -24,6 +22,8 @@ from uavctl.lab.flight_risk import FlightFilter, FlightRisk, bound_probability, 
 from uavctl.lab.trial import FlightCounts, TrackedFlyer, compute_excess_m, get_room_limits
 from uavctl.loop import ControlLoop
 from uavctl.records import PositionSample
+from uavctl.wiring.controller import build_conditioned, build_controller, build_estimator, build_plant
+from uavctl.wiring.rehearsal import make_rehearsal_start
 
 NO_WALL = "sets.state_lower=[-inf,-1.5,-inf,-inf,-1.5,-inf,-inf,-1.0,-inf]"
 ONE_WALL = "sets.state_upper=[3.0,1.5,inf,inf,1.5,inf,inf,1.0,inf]"

@@ -8,7 +8,6 @@ from itertools import pairwise
 import pytest
 from mavlink_rig import MS, OFFBOARD, SECOND, Peer, events, make_link, packets, read, samples, statuses
 
-from uavctl.build.controller import build_estimator
 from uavctl.config import load_config
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
@@ -17,6 +16,7 @@ from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Setpoint, SetpointSource, Severity
+from uavctl.wiring.controller import build_estimator
 
 NOW = 50_000 * SECOND
 SETPOINT = Setpoint(at_ns=NOW, accel_mps2=(0.5, 0.0, -0.25), source=SetpointSource.PLAN)

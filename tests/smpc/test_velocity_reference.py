@@ -16,13 +16,13 @@ from scipy.integrate import solve_ivp
 from sim.vehicle.linear import make_linear_model
 from sim.wind import Wind
 from uavctl.arrays import SECOND_NS, Array
-from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.constraint_names import name_constraints
 from uavctl.errors import ConfigError, DesignError
 from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import STATES_PER_AXIS, Plant, VelocityReferenceAxis, count_reach_steps, velocity_reference
+from uavctl.wiring.controller import build_plant
 
 DT = 0.05
 AXIS = VelocityReferenceAxis(

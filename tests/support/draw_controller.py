@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
+from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
 TRIES = 30  # draws of a design until there is one
 # Presets as they are, and one with bursts: a third of the draws.

@@ -11,10 +11,10 @@ from mcap.writer import Writer
 from places import DATA
 
 from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlog
-from uavctl.build.controller import build_controller
 from uavctl.config import load_config
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
+from uavctl.wiring.controller import build_controller
 
 TLOGS = ("arducopter-vicon.tlog", "px4-offboard.tlog", "hand-over-arducopter-gps.tlog")
 Row = tuple[str, str, int, bytes]  # topic, encoding, log time, message

@@ -9,13 +9,13 @@ import msgspec
 
 from logs.recording.flight import FlightData
 from sim.simulation import World
-from uavctl.build.controller import build_controller, build_flight_design, make_design_record
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
 from uavctl.records import Header, Record, Sink
 from uavctl.smpc.conditioned.design import AnyDesign
+from uavctl.wiring.controller import build_controller, build_flight_design, make_design_record
 
 R = TypeVar("R", bound=Record)
 

@@ -13,7 +13,6 @@ from design_rig import one_axis, paper_plant, spec
 from full_problem import backoff_table, horizons
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.components import Component, decompose
@@ -26,6 +25,7 @@ from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_design
 
 PRESETS = ("paper", "room-hahn-stursberg")
 # For most tests of both, two axes will do for a person who waits.

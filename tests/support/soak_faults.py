@@ -11,9 +11,9 @@ import numpy as np
 from msgspec.structs import replace
 from soak_rig import fly
 
-from uavctl.build.controller import Prepared
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
+from uavctl.wiring.controller import Prepared
 
 FLIGHT_S = 180.0
 SPANS = ("blackout", "held", "uplink_blackout", "occluded", "swapped", "frozen")

@@ -12,9 +12,9 @@ from soak_rig import LoopWatch, fly
 
 from sim.simulation import World
 from uavctl.arrays import Array
-from uavctl.build.controller import Prepared
 from uavctl.config import load_config
 from uavctl.records import ControlMode
+from uavctl.wiring.controller import Prepared
 
 AUTOPILOTS = ("px4", "ardupilot")
 TAKE_OFF_M = 1.2

@@ -13,10 +13,10 @@ from soak_rig import LoopWatch, fly
 
 from sim.cameras import AXES
 from sim.simulation import World
-from uavctl.build.controller import Prepared
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 from uavctl.records import ControlMode, Vec3
+from uavctl.wiring.controller import Prepared
 
 FLIGHT_S = 30.0
 OUTSIDE_M = 1.0  # beyond the position limits of `[sets]`, ceiling included

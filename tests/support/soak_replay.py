@@ -23,13 +23,13 @@ from logs.recording.replay import ReplayResult
 from logs.recording.views import ViewBuilder
 from sim.simulation import Peers, World
 from uavctl.arrays import SECOND_NS
-from uavctl.build.controller import Prepared
 from uavctl.cli.replays import replay_flight
 from uavctl.config import Config
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import Command, Order, Received, Record, Send, Sink
+from uavctl.wiring.controller import Prepared
 
 
 class SignatureChannel:

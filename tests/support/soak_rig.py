@@ -10,7 +10,6 @@ from pathlib import Path
 from logs.recording.ends import put_header
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
-from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.daemon.flight_orders import compute_stop_limit_s
 from uavctl.loop import ControlLoop
@@ -29,6 +28,7 @@ from uavctl.records import (
     Ticked,
     Vec3,
 )
+from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
 ALARMS = ("envelope-", "sample-jump", "sample-frozen")
 MOST_FINDINGS = 20  # of one flight: the first ones tell

@@ -9,10 +9,10 @@ from loopback_rig import header
 
 from logs.recording.flight import FlightData
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design, build_estimator, build_plant
 from uavctl.config import Config, load_config
 from uavctl.flight.kalman import make_kalman
 from uavctl.records import ControlMode, Decision, PositionSample, Record, StepInput, VehicleStatus
+from uavctl.wiring.controller import build_design, build_estimator, build_plant
 
 VEHICLE = VehicleStatus(at_ns=0, autopilot="px4", armed=True, mode="OFFBOARD", external=True)
 CAPTURED_NS = 30_000_000  # into each step

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim.faults import check_fault_support
 from uavctl.arrays import Array
-from uavctl.build.controller import build_flight_design, build_plant, build_problem, build_solver
-from uavctl.build.link import build_ages
 from uavctl.config import Config, dump_config, parse
 from uavctl.config import load as load_file
 from uavctl.config.load import format_overrides
@@ -29,6 +27,8 @@ from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import Plant
+from uavctl.wiring.controller import build_flight_design, build_plant, build_problem, build_solver
+from uavctl.wiring.link import build_ages
 
 if TYPE_CHECKING:
     import pandas

@@ -20,7 +20,6 @@ from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
 from uavctl.api.control import Runs, Signal, SolvedPlan, Source, get_limits, list_signals, load, resolve_config
 from uavctl.arrays import Array
-from uavctl.build.controller import build_flight_design, build_problem, prepare
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
 from uavctl.daemon.flight_orders import FlightOrders, check_places, compute_stop_limit_s, make_goto_keys
@@ -28,6 +27,7 @@ from uavctl.errors import RecordingError, UsageError, in_words, need
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
 from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import build_flight_design, build_problem, prepare
 
 if TYPE_CHECKING:
     import pandas

@@ -14,7 +14,6 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from uavctl.build.controller import build_conditioned, build_design, build_spec
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, locate_design_errors, make_progress, make_table
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
@@ -22,6 +21,7 @@ from uavctl.lab.bench.loop import LoopBench, LoopRun, run_loop_bench
 from uavctl.lab.bench.run import DEFAULT_SIZES, DecisionBench, ReportProgress, run_bench, time_decisions, time_flight
 from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
 from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.wiring.controller import build_conditioned, build_design, build_spec
 
 
 def report_loop(common: Common, seconds: float, runs: int) -> int:

@@ -20,9 +20,6 @@ from rich.text import Text
 
 from logs.recording.parameters import ParameterReader, make_parameter_records
 from logs.recording.topics import PARAMETER
-from uavctl.build.controller import Prepared, build_controller, build_flight_design
-from uavctl.build.rehearsal import rehearse
-from uavctl.build.rest import check_axes
 from uavctl.check.findings import Item, ItemState, describe_item, find_refusals, judge_item, make_item
 from uavctl.check.preflight import Preflight
 from uavctl.cli.common import (
@@ -47,6 +44,9 @@ from uavctl.io.transport import wait
 from uavctl.mavlink.connection import make_links
 from uavctl.records import Checked, Datagram, Sink
 from uavctl.smpc.conditioned.design import ConditionedDesign
+from uavctl.wiring.controller import Prepared, build_controller, build_flight_design
+from uavctl.wiring.rehearsal import rehearse
+from uavctl.wiring.rest import check_axes
 
 MOVE_LIMIT_S = 120.0  # for the guided movements, beside the listening
 

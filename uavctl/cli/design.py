@@ -14,17 +14,6 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from uavctl.arrays import Array
-from uavctl.build.controller import (
-    build_conditioned,
-    build_controller,
-    build_design,
-    build_flight_design,
-    build_solver,
-    build_spec,
-    make_start_state,
-)
-from uavctl.build.mission import build_names
-from uavctl.build.rehearsal import RehearsalResult, rehearse
 from uavctl.cli.common import (
     DEFAULTS,
     Column,
@@ -46,6 +35,17 @@ from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.design import AnyDesign, ConditionedDesign, make_conditioned_record
 from uavctl.smpc.hahn_stursberg.design import Design, design_record
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
+from uavctl.wiring.controller import (
+    build_conditioned,
+    build_controller,
+    build_design,
+    build_flight_design,
+    build_solver,
+    build_spec,
+    make_start_state,
+)
+from uavctl.wiring.mission import build_names
+from uavctl.wiring.rehearsal import RehearsalResult, rehearse
 
 
 def report_gains(common: Common) -> int:

@@ -7,12 +7,12 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from uavctl.build.controller import build_conditioned, build_controller
 from uavctl.cli.common import SEED, make_progress
 from uavctl.config import Config
 from uavctl.config.connections import MAX_REHEARSALS
 from uavctl.lab.flight_risk import FlightRisk, rehearse_flights
 from uavctl.smpc.conditioned.design import ConditionedDesign
+from uavctl.wiring.controller import build_conditioned, build_controller
 
 Rehearsals = Annotated[
     int | None,

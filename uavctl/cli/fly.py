@@ -13,7 +13,6 @@ from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import Recorder
 from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
-from uavctl.build.controller import build_flight_design, prepare
 from uavctl.check.findings import Item
 from uavctl.cli.common import (
     DEFAULTS,
@@ -56,6 +55,7 @@ from uavctl.daemon.tick_limit import limit_ticks
 from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
+from uavctl.wiring.controller import build_flight_design, prepare
 
 
 def fly(

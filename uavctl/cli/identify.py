@@ -19,7 +19,6 @@ from logs.recording.output_files import refuse_recording_path, write_atomically
 from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
-from uavctl.build.controller import build_flight_design
 from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_progress, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
@@ -27,6 +26,7 @@ from uavctl.errors import DesignError, UsageError
 from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
 from uavctl.lab.identify.page import render_identify_page
 from uavctl.lab.identify.result import Identification, count_fits, describe_loss, identify
+from uavctl.wiring.controller import build_flight_design
 
 
 def identify_command(

@@ -11,12 +11,12 @@ from typing import Annotated, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from uavctl.build.controller import MIN_OUTSIDE_M, build_flight_design, compute_reference_limits
-from uavctl.build.mission import compute_reference_range
 from uavctl.check.parameters import compute_max_accel_mps2
 from uavctl.cli.common import print_message
 from uavctl.config import parse
 from uavctl.errors import UsageError
+from uavctl.wiring.controller import MIN_OUTSIDE_M, build_flight_design, compute_reference_limits
+from uavctl.wiring.mission import compute_reference_range
 
 WALL_M = MIN_OUTSIDE_M  # from a limit of the vehicle's centre to the wall; the envelope allows as much
 TIMEOUT_S = 0.7  # COM_OF_LOSS_T and GUID_TIMEOUT of docs/first-flight.md: longest time of the last acceleration

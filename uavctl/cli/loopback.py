@@ -21,7 +21,6 @@ from logs.recording.recorder import DerivedTopics, Recorder
 from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
-from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.cli.common import (
     DEFAULTS,
     SEED,
@@ -56,6 +55,7 @@ from uavctl.io.signed_connection import open_links
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
 from uavctl.loop import ControlLoop
 from uavctl.records import Sink, Truth
+from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
 START_LIMIT_S = 60.0
 

@@ -16,7 +16,6 @@ from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from uavctl.build.controller import build_design, build_spec
 from uavctl.cli.common import (
     SEED,
     WORKERS,
@@ -43,6 +42,7 @@ from uavctl.lab.paper.claims import (
 )
 from uavctl.lab.paper.runs import MAX_LOCAL_RUNS, Flights, ReportProgress, Setup, fly_all
 from uavctl.number_text import format_percent_above
+from uavctl.wiring.controller import build_design, build_spec
 
 _RUN_LIMITS = validators.Number(gte=1, lte=1_000_000)
 # Above this number a second design would take minutes more for the same answer.

@@ -11,13 +11,13 @@ from cyclopts import Parameter
 
 from logs.recording.summary import count
 from logs.recording.tlog import TlogPacket, replay_tlog
-from uavctl.build.controller import build_flight_design, prepare
 from uavctl.cli.common import DEFAULTS, Common, Flight, System, locate_design_errors, warn
 from uavctl.cli.replay_table import make_foreign_table, make_replay_table
 from uavctl.cli.replays import read_foreign_vehicle, replay_flight
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
+from uavctl.wiring.controller import build_flight_design, prepare
 
 
 def replay(

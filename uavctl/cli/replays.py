@@ -17,16 +17,6 @@ from logs.recording.replay import replay as replay_recording
 from logs.recording.senders import choose_vehicle
 from logs.recording.tlog import TlogPacket
 from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
-from uavctl.build.controller import (
-    ARITHMETIC_NAME,
-    CONTROLLER,
-    Prepared,
-    build_flight_design,
-    collect_versions,
-    prepare,
-    read_cpu_model,
-)
-from uavctl.build.outside import CONTROLLER_KEY
 from uavctl.cli import restart_process
 from uavctl.cli.common import locate_design_errors, warn
 from uavctl.config import Config, LoadedConfig
@@ -35,6 +25,16 @@ from uavctl.errors import DesignError, RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import make_links
 from uavctl.records import Header, StepInput
+from uavctl.wiring.controller import (
+    ARITHMETIC_NAME,
+    CONTROLLER,
+    Prepared,
+    build_flight_design,
+    collect_versions,
+    prepare,
+    read_cpu_model,
+)
+from uavctl.wiring.outside import CONTROLLER_KEY
 
 _LIBRARY_VERSION = "uavctl 0.2.0, commit b5d416b"  # replays flights of version 0.1 and its own with a policy library
 

@@ -13,13 +13,13 @@ from cyclopts import Parameter, validators
 from sim.faults import find_fault_problems
 from sim.fleet import make_fleet
 from sim.server import Ready, VehicleSetup, serve_all
-from uavctl.build.rest import check_axes
 from uavctl.cli.common import DEFAULTS, Common, locate_design_errors, make_message_console, write_document
 from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.cli.sim_view import show_view
 from uavctl.config.load import add_faults
 from uavctl.records import Truth
+from uavctl.wiring.rest import check_axes
 
 if TYPE_CHECKING:
     pass

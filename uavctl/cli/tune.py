@@ -21,7 +21,6 @@ from logs.recording.flight import FlightData
 from logs.recording.output_files import write_atomically
 from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.summary import summarise
-from uavctl.build.controller import build_flight_design
 from uavctl.cause import Cause
 from uavctl.cli.common import (
     SEED,
@@ -88,6 +87,7 @@ from uavctl.lab.tune.run_folder import (
     render_tune_page,
 )
 from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import build_flight_design
 
 
 def render_changes(result: TunedResult) -> RenderableType:

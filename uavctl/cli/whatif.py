@@ -28,7 +28,6 @@ from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER
 from logs.recording.views import ViewBuilder
 from uavctl.arrays import Array
-from uavctl.build.controller import Prepared
 from uavctl.cli.common import SEED, Common, Flight, Json, make_progress, make_table, warn
 from uavctl.cli.flying import conclude_flight
 from uavctl.cli.replays import (
@@ -66,6 +65,7 @@ from uavctl.lab.whatif.flight import (
     refly,
 )
 from uavctl.records import Header, Record
+from uavctl.wiring.controller import Prepared
 
 RECORDED, CONFIGURED = "recorded", "configured"
 

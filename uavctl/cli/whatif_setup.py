@@ -9,7 +9,6 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from uavctl.arrays import Array
-from uavctl.build.controller import Prepared, build_flight_design, build_problem, prepare
 from uavctl.cli.common import locate_design_errors
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import get_dimensions
@@ -21,6 +20,7 @@ from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
 from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import Prepared, build_flight_design, build_problem, prepare
 
 # Sections that made the recorded bytes, and those that read them.
 RECORDED_KEYS = ("sim", "daemon", "frame", "clock", "hand_over", "relay", "security", "log", "check", "duration_s")

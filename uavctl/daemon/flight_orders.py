@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from uavctl.build.controller import compute_reference_limits
-from uavctl.build.mission import build_mission
 from uavctl.config import Config
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
@@ -15,6 +13,8 @@ from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
 from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import compute_reference_limits
+from uavctl.wiring.mission import build_mission
 
 DOWN = 2
 LANDING_S = 10.0  # after braking: for the landing request

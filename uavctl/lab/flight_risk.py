@@ -1,7 +1,7 @@
 """Risk of a whole flight: how many of many rehearsed flights leave the room, and by how much.
 
-`uavctl.build.rehearsal` flies the mission once, without disturbance. Here it is flown many times in the linear world of
-the configuration, with all that is random there:
+`uavctl.wiring.rehearsal` flies the mission once, without disturbance. Here it is flown many times in the linear world
+of the configuration, with all that is random there:
 
 1. The vehicle moves as x(k+1) = A x(k) + B u(k) + E w(k), w ~ N(0, W), as the plans assume.
 2. A position is captured each Δt, with noise, and is lost or late as the link says. Where the flight uses inertial
@@ -26,8 +26,6 @@ import numpy as np
 from scipy.special import betaincinv
 
 from uavctl.arrays import SECOND_NS, Array
-from uavctl.build.controller import build_estimator
-from uavctl.build.rehearsal import MAX_STEPS, make_rehearsal_start
 from uavctl.config import Config
 from uavctl.config.checks import get_position_limits_m
 from uavctl.flight.controller import Controller
@@ -43,6 +41,8 @@ from uavctl.smpc.answer import Preview
 from uavctl.smpc.batch import Counts
 from uavctl.smpc.conditioned.design import ConditionedDesign
 from uavctl.smpc.plant import Plant
+from uavctl.wiring.controller import build_estimator
+from uavctl.wiring.rehearsal import MAX_STEPS, make_rehearsal_start
 
 CONFIDENCE = 0.95  # of the bound of the probability
 _INERTIAL = 4  # child of a run's seed: 0 to 3 are those of `uavctl.lab.campaign.draws`

@@ -12,12 +12,12 @@ from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.topics import ENDED
 from logs.recording.views import ViewBuilder
 from sim.simulation import World
-from uavctl.build.controller import Prepared
 from uavctl.cause import Cause
 from uavctl.config.types import Config
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.records import Received, Send, Ticked, Truth
+from uavctl.wiring.controller import Prepared
 
 TRUTH = "/sim/truth"
 

@@ -18,8 +18,6 @@ from scipy.interpolate import CubicHermiteSpline
 
 from sim.simulation import World
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned, build_controller, build_plant, compute_reference_limits
-from uavctl.build.mission import build_reference_limits, compute_reference_range
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.mission import TrajectoryConfig
@@ -31,6 +29,8 @@ from uavctl.records import ControlMode, Decision, Flyer, Plan, Received, Record,
 from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import build_conditioned, build_controller, build_plant, compute_reference_limits
+from uavctl.wiring.mission import build_reference_limits, compute_reference_range
 
 Scenario = Literal["hold", "eight", "blackout"]
 AutopilotName = Literal["px4", "ardupilot"]

@@ -13,7 +13,6 @@ from optimisation_cases import PAPER_LOWER, PAPER_UPPER, START, paper
 
 from sim.simulation import World
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned, build_controller
 from uavctl.cli import bench as bench_cmd
 from uavctl.cli.app import run as command
 from uavctl.config import load_config
@@ -40,6 +39,7 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.shortcut import FROZEN
 from uavctl.smpc.link import bernoulli
+from uavctl.wiring.controller import build_conditioned, build_controller
 
 WANTED = {
     "printed_ms", "printed_status", "cvxpy_axis_ms", "exact_axis_ms", "flown_us", "ratio_printed", "ratio_cvxpy",

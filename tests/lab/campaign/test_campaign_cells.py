@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from campaign_rig import cells, controller, read, table
 
-from uavctl.build.controller import build_problem
 from uavctl.config import load_config
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.controllers import (
@@ -26,6 +25,7 @@ from uavctl.lab.campaign.world import simulate
 from uavctl.smpc.baselines import Lqg, PacketisedPredictive, WorstCaseDelay
 from uavctl.smpc.batch import BatchSmpc
 from uavctl.smpc.hahn_stursberg.design import kappa
+from uavctl.wiring.controller import build_problem
 
 LINKS = table("link", "good", 'set = ["link.loss=0.1"]') + table("link", "bad", 'set = ["link.loss=0.6"]')
 WEAK = table("plant", "weak", 'set = ["plant.b=[[0.1, 0.0], [0.2, 0.0], [0.0, 0.1], [0.0, 0.2]]"]')

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from places import ROOT
 
-from uavctl.build.controller import build_design
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.controllers import CellSetting, draw_conditions
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.trials import is_trial_file, read_trial
+from uavctl.wiring.controller import build_design
 
 FOLDER = ROOT / "docs" / "campaigns"
 EVERY = sorted(FOLDER.glob("*.toml"))

@@ -10,13 +10,13 @@ import pytest
 from campaign_results import cell, runs, write
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned, build_design
-from uavctl.build.mission import build_reference_limits
 from uavctl.config import load_config
 from uavctl.lab.campaign.page import render_report
 from uavctl.lab.campaign.results import read_results, summarise
 from uavctl.lab.campaign.tasks import compute_path_figures
 from uavctl.lab.trial import compute_exact_usable_share
+from uavctl.wiring.controller import build_conditioned, build_design
+from uavctl.wiring.mission import build_reference_limits
 
 CONFIG = load_config("room-hahn-stursberg")  # target (1.5, 1, -1.2), walls at +-3, +-2.5, -2.5 and 0
 DT_S = CONFIG.plant.dt_s

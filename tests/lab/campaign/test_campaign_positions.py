@@ -13,7 +13,6 @@ from scipy.stats import binom
 
 from logs.report.run_statistics import max_step_rate
 from uavctl.arrays import Array
-from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
 from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
 from uavctl.flight.kalman import make_kalman
@@ -28,6 +27,7 @@ from uavctl.smpc.baselines import Governor, MeanQp
 from uavctl.smpc.batch import Counts, Information, predict, predict_covariance
 from uavctl.smpc.estimate import innovation_form
 from uavctl.smpc.nominal import propagate_covariance
+from uavctl.wiring.controller import build_estimator, build_plant, build_problem
 
 S = 1_000_000_000
 RUNS, STEPS = 4, 25

@@ -7,8 +7,6 @@ import pytest
 
 from sim.channel import Channel
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design, build_plant
-from uavctl.build.link import build_delayed_link
 from uavctl.config import Config, load_config
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.draws import draw
@@ -16,6 +14,8 @@ from uavctl.lab.campaign.world import LinearWorld, simulate
 from uavctl.smpc.batch import BatchSmpc, Decisions, Information, predict
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_design, build_plant
+from uavctl.wiring.link import build_delayed_link
 
 RUNS, STEPS = 20_000, 12
 

@@ -16,7 +16,6 @@ from sim.channel import Channel
 from sim.simulation import World
 from sim.vehicle.linear import LinearVehicle
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design, build_plant
 from uavctl.config import Config, load_config
 from uavctl.config.connections import ClockConfig
 from uavctl.config.link import LinkConfig
@@ -26,6 +25,7 @@ from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.records import Decision, Truth
 from uavctl.smpc.batch import BatchSmpc, Counts
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
+from uavctl.wiring.controller import build_design, build_plant
 
 STEPS, DT_NS = 50, 1_000_000_000
 NEVER = 1e6  # [s], [m], [m/s]

@@ -11,13 +11,13 @@ from loopback_rig import lockstep
 
 from sim.channel import Channel
 from uavctl.arrays import Array
-from uavctl.build.link import build_delayed_link, build_link, compute_promised_probability
 from uavctl.config import load, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import ConfigError, DesignError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.draws import draw
 from uavctl.records import Truth
+from uavctl.wiring.link import build_delayed_link, build_link, compute_promised_probability
 
 S = 1_000_000_000
 INF = math.inf

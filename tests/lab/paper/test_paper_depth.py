@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 import pytest
 
-from uavctl.build.controller import build_design, build_spec
 from uavctl.config import load_config
 from uavctl.errors import UavctlError
 from uavctl.lab.paper import depth as deep
@@ -18,6 +17,7 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.lqg_bound import stationary_bound
 from uavctl.smpc.nominal import lqr
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_design, build_spec
 
 COARSE = GridSize(states=35, inputs=31)
 

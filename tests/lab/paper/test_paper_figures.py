@@ -11,10 +11,10 @@ import pytest
 from scipy.stats import chi2
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.lab.paper.figures import AgeReference, draw_ages_svg, draw_trajectories_svg
 from uavctl.smpc.hahn_stursberg.design import Design
+from uavctl.wiring.controller import build_design
 
 SVG = "{http://www.w3.org/2000/svg}"
 LINK = AgeReference(tau=4, horizon=12, loss=0.3)

@@ -8,7 +8,6 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design, build_plant, make_start_state
 from uavctl.config import load_config
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.draws import draw
@@ -37,6 +36,7 @@ from uavctl.lab.paper.runs import (
 )
 from uavctl.smpc.batch import BatchSmpc, Decisions
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
+from uavctl.wiring.controller import build_design, build_plant, make_start_state
 
 RUNS, STEPS, SEED = 20, 50, 3
 

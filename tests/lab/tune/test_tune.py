@@ -12,7 +12,6 @@ import pytest
 from loopback_rig import lockstep
 
 from logs.recording.flight import FlightData
-from uavctl.build.controller import build_flight_design
 from uavctl.config import Config, load_config
 from uavctl.errors import UsageError
 from uavctl.lab.identify.history import read_recorded_history
@@ -34,6 +33,7 @@ from uavctl.lab.tune.run_folder import (
     compute_flight_figures,
     compute_plan_errors_m,
 )
+from uavctl.wiring.controller import build_flight_design
 
 BOX = parse_box("-1.5,-1.4,-2,1.5,1.4,-0.4")
 ASKED = TuneSettings(box="b", flight="", simulated=True, take_off_m=None)

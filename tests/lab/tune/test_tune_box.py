@@ -14,13 +14,13 @@ import sim.vehicle.quadrotor as quadrotor
 from sim import simulation
 from sim.simulation import World
 from sim.vehicle.airframe import CRAZYFLIE_2
-from uavctl.build.controller import build_controller, build_flight_design
 from uavctl.config import Config, load_config
 from uavctl.lab.trial import FlightCounts, compute_excess_m
 from uavctl.lab.tune.box_monitor import MIN_REPEAT_SHARE, BoxMonitor
 from uavctl.lab.tune.excitation import HOLD_S, MIN_STEP_M, PAUSE_S, SafeBox, add_excitation, parse_box
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, ControlMode, Decision, Estimate, Event, Order, Send, Severity, Ticked, Vec3
+from uavctl.wiring.controller import build_controller, build_flight_design
 
 BOX = parse_box("-1.5,-1.4,-2,1.5,1.4,-0.4")
 LEFT_M = 0.15  # to the nearest side; without a share for overshoot 0.07 m were left

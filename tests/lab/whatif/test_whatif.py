@@ -23,7 +23,6 @@ from whatif_rig import (
 
 from logs.recording.topics import encode
 from sim.vehicle.linear import LinearVehicle, make_linear_model
-from uavctl.build.controller import build_controller, build_design
 from uavctl.errors import RecordingError
 from uavctl.lab.whatif.comparison import compare_reproduction, compute_max_distance_m, cut_entries, fit_model
 from uavctl.lab.whatif.flight import (
@@ -37,6 +36,7 @@ from uavctl.lab.whatif.flight import (
     refly,
 )
 from uavctl.records import Datagram, Decision, Plan, PositionSample, Record, Setpoint, StepInput, Truth
+from uavctl.wiring.controller import build_controller, build_design
 
 
 @pytest.mark.slow

@@ -9,12 +9,12 @@ import pytest
 from loopback_rig import MemorySink
 from whatif_rig import PAPER, compute_differences, fly_case, history, load_case_config
 
-from uavctl.build.controller import build_controller, build_problem
 from uavctl.lab.campaign.controllers import BaselineSolver, build_from_recipe, make_recipe
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
 from uavctl.lab.whatif.flight import make_response, refly
 from uavctl.records import Plan, Truth
 from uavctl.smpc.batch import Information
+from uavctl.wiring.controller import build_controller, build_problem
 
 
 @pytest.mark.slow

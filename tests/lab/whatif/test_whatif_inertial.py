@@ -17,7 +17,6 @@ from whatif_rig import Case, fly_again, fly_case, history, load_case_config
 
 from logs.recording.topics import encode
 from uavctl.arrays import Array
-from uavctl.build.controller import build_controller
 from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
 from uavctl.lab.whatif.comparison import fit_model
 from uavctl.lab.whatif.flight import SimulatedLink, VehicleResponse, make_recorded_flight, make_response, refly
@@ -26,6 +25,7 @@ from uavctl.mavlink.codec import decode
 from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.vehicle import VehicleMonitor
 from uavctl.records import Datagram, Decision, Event, InertialSample, Plan, Setpoint, StepInput, Truth, Vec3
+from uavctl.wiring.controller import build_controller
 
 MILLI_G_MPS2 = 9.80665e-3
 BY: Vec3 = (0.7, -1.3, 0.4)

@@ -15,11 +15,11 @@ from report_rig import omit_pages
 
 from logs.recording.reader import explain_missing_end, find_segments, read_kind
 from logs.recording.replay import MAKERS, FieldNames, ReplayResult, find_different_leaves, replay
-from uavctl.build.controller import build_plant
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.flight.limits import LimitsParameters, limit_setpoint
 from uavctl.records import Decision, Event, LinkStats, Setpoint, SetpointSource, StepInput, Vec3
+from uavctl.wiring.controller import build_plant
 
 TICK = 57  # in which the rule of a test changes
 

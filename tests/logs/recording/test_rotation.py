@@ -26,11 +26,11 @@ from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.topics import get_definition
 from logs.recording.views import ViewBuilder
-from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig
 from uavctl.errors import ConfigError, RecordingError
 from uavctl.records import Header
+from uavctl.wiring.controller import build_design
 
 SMALL = LogConfig(chunk_bytes=1024, segment_bytes=3000)
 LOW, STOP = 3000, 1000

@@ -9,13 +9,13 @@ import pytest
 from scipy.stats import norm
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_problem
 from uavctl.config.load import load_config
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned import adaptation
 from uavctl.smpc.conditioned.adaptation import AgeRecord, BudgetChoice, LoopState, charge_risk, count_age
 from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
 from uavctl.smpc.link import bernoulli
+from uavctl.wiring.controller import build_problem
 
 ALLOWED = 0.05
 LOSS = 0.3

@@ -14,13 +14,18 @@ from msgspec.structs import replace
 from logs.recording.design_view import read_design
 from logs.recording.reader import read, read_header
 from logs.recording.recorder import SyncRecorder
-from uavctl.build.controller import build_conditioned, build_flight_design, compute_reference_limits, make_design_record
 from uavctl.cli.app import run as main
 from uavctl.cli.flight_risk import compute_flight_risk
 from uavctl.config import dump_config, load_config
 from uavctl.config.types import ScheduleConfig, SmpcConfig
 from uavctl.records import ControlMode, Decision, Header, Plan, SolveStatus, Truth
 from uavctl.smpc.conditioned.planner import METHOD
+from uavctl.wiring.controller import (
+    build_conditioned,
+    build_flight_design,
+    compute_reference_limits,
+    make_design_record,
+)
 
 SCHEME = "smpc.scheme=age-conditioned"
 FLOWN = ("loopback", "--config", "room-hahn-stursberg", "--set", SCHEME)
@@ -37,7 +42,7 @@ def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("design.make_design", "design.design_record", "design.assemble_design", "exact.check_schedule"):
         monkeypatch.setattr(f"uavctl.smpc.hahn_stursberg.{name}", refuse)
     monkeypatch.setattr("uavctl.smpc.hahn_stursberg.late.add_late_designs", refuse)
-    monkeypatch.setattr("uavctl.build.controller.build_reference_limits", refuse)
+    monkeypatch.setattr("uavctl.wiring.controller.build_reference_limits", refuse)
 
 
 def quick(folder: Path) -> str:

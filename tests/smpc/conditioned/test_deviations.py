@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from baseline_rig import problem
 
-from uavctl.build.controller import build_conditioned, build_controller, build_estimator, build_problem
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman, settle_covariance
 from uavctl.smpc.conditioned.backoffs import RowDeviations, bound_widening, find_opposite_rows
 from uavctl.smpc.estimate import add_bias, innovation_form
 from uavctl.smpc.nominal import find_parts
+from uavctl.wiring.controller import build_conditioned, build_controller, build_estimator, build_problem
 
 DRIFT = 0.3
 

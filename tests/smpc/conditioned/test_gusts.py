@@ -10,7 +10,6 @@ import pytest
 from scipy.linalg import block_diag
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_problem
 from uavctl.config.load import load_config
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.adaptation import (
@@ -27,6 +26,7 @@ from uavctl.smpc.conditioned.backoffs import RowDeviations
 from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import find_parts, propagate_covariance
+from uavctl.wiring.controller import build_problem
 
 ALLOWED, LOSS, STEPS, FIRST = 0.05, 0.3, 2200, 200
 WALL, CORNER = "[0, 19, 0]", "[19, 19, 0]"

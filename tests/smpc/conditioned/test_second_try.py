@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_problem
 from uavctl.config.load import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Preview
@@ -20,6 +19,7 @@ from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import propagate_covariance
 from uavctl.smpc.qp import OPEN, QuadraticProgram, Sense
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_problem
 
 # Found among 240,000 random states, ages and spreads: in the program of the second axis DAQP cycles.
 STATE = ("0x1.d9acb060ddc60p+3", "0x1.e8019fbf626b8p+3", "0x1.70433dacaca60p+3", "0x1.c6aff29e7937ep+2")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.build.controller import build_controller
 from uavctl.config import load_config
 from uavctl.lab.bench.run import draw_questions
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.working_set import WorkingSetGuess
+from uavctl.wiring.controller import build_controller
 
 
 def requested(name: str) -> list[Answer]:

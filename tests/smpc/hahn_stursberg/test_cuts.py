@@ -11,10 +11,10 @@ import pytest
 from cut_rig import NAME, Cuts
 from report_rig import omit_pages
 
-from uavctl.build.controller import Prepared
 from uavctl.cli.app import run
 from uavctl.cli.replays import make_recorded_controller
 from uavctl.config import Config
+from uavctl.wiring.controller import Prepared
 
 SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log={segment_bytes=100000, chunk_bytes=4096}")
 

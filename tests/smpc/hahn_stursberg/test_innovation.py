@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_controller, build_design, build_plant, build_spec
 from uavctl.config import load_config
 from uavctl.errors import DesignError
 from uavctl.flight.kalman import (
@@ -30,6 +29,7 @@ from uavctl.smpc.hahn_stursberg.components import decompose
 from uavctl.smpc.hahn_stursberg.design import Design, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, check_schedule
 from uavctl.smpc.plant import Plant, drag_lag
+from uavctl.wiring.controller import build_controller, build_design, build_plant, build_spec
 
 STEP_NS = 200_000_000
 STD_M = 0.005

@@ -17,8 +17,6 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from logs.recording.replay import replay
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned, build_design, build_solver
-from uavctl.build.link import build_delayed_link, compute_late_steps
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
 from uavctl.records import Decision, Plan, SolveStatus
@@ -29,6 +27,8 @@ from uavctl.smpc.hahn_stursberg.late import add_late_designs, make_late_design
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_conditioned, build_design, build_solver
+from uavctl.wiring.link import build_delayed_link, compute_late_steps
 
 
 def axis_spec(**changes: Any) -> DesignSpec:

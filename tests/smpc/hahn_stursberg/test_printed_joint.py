@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
+from uavctl.wiring.controller import build_design
 
 START = np.array([35.0, -2.0, -20.0, -4.0])
 

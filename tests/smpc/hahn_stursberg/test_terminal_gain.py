@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from design_rig import spec
 
-from uavctl.build.controller import make_start_state
 from uavctl.cli.app import run
 from uavctl.config import load
 from uavctl.lab.terminal_gain import compare_gains
 from uavctl.smpc.hahn_stursberg.design import make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost
+from uavctl.wiring.controller import make_start_state
 
 BEST = [[-0.151872, -0.787386, 0.0, 0.0], [0.0, 0.0, -0.151872, -0.787386]]
 START = np.array([35.0, -2.0, -20.0, -4.0])

@@ -17,7 +17,6 @@ import numpy as np
 
 from sim.simulation import World
 from uavctl.arrays import Array
-from uavctl.build.controller import build_controller
 from uavctl.config import Config
 from uavctl.errors import UavctlError
 from uavctl.lab.bench.timing import (
@@ -42,6 +41,7 @@ from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
 from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
 from uavctl.smpc.hahn_stursberg.shortcut import FROZEN, ShortcutSolver
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_controller
 
 _N_COVARIANCES = 7  # in turns: the covariance of a filter changes at each decision
 

@@ -19,16 +19,6 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from uavctl.arrays import Array
-from uavctl.build.controller import (
-    build_conditioned,
-    build_design,
-    build_plant,
-    build_problem,
-    build_solver,
-    make_start_state,
-    require_value,
-)
-from uavctl.build.rest import check_axes
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
@@ -48,6 +38,16 @@ from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import SilencePlanner, make_answer
 from uavctl.smpc.pid import CascadedPid, PidGains, tune
+from uavctl.wiring.controller import (
+    build_conditioned,
+    build_design,
+    build_plant,
+    build_problem,
+    build_solver,
+    make_start_state,
+    require_value,
+)
+from uavctl.wiring.rest import check_axes
 
 _STUDENT_DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
 

@@ -17,7 +17,6 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from uavctl.build.outside import BATCH_METHODS, create_controller, load_controller_class
 from uavctl.config import Config, Source, dump_config, load, parse, presets
 from uavctl.config.checks import get_dimensions
 from uavctl.config.document import (
@@ -37,6 +36,7 @@ from uavctl.config.mission import MissionConfig
 from uavctl.errors import ConfigError, DesignError
 from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
+from uavctl.wiring.outside import BATCH_METHODS, create_controller, load_controller_class
 
 KINDS = ("smpc", "lqg", "packetised", "mean-qp", "governor", "worst-case-delay", "hold-last", "zero-on-loss", "pid")
 KIND_KEY = "kind"

@@ -17,7 +17,6 @@ from msgspec import Meta
 
 from logs.report.statistics import replace_infinite
 from uavctl import __version__
-from uavctl.build.controller import build_controller, build_flight_design
 from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import MAX_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
@@ -51,6 +50,7 @@ from uavctl.lab.trial import (
     fly_trial,
     make_design_config,
 )
+from uavctl.wiring.controller import build_controller, build_flight_design
 
 QUADROTOR = "quadrotor"
 MAX_TRIALS = 100_000

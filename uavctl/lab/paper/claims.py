@@ -14,12 +14,12 @@ import numpy as np
 
 from logs.report.run_statistics import clopper_pearson
 from uavctl.arrays import Array
-from uavctl.build.controller import build_problem, build_spec, require_value
 from uavctl.lab.paper.runs import LIKELIHOOD, MAX_DRAWN, Flights, Setup, Totals, fly_runs, get_axis_planes
 from uavctl.smpc.baselines import Lqg, WorstCaseDelay
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
 from uavctl.smpc.lqg_bound import stationary_bound
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_problem, build_spec, require_value
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):

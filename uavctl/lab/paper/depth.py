@@ -20,7 +20,6 @@ from scipy.ndimage import map_coordinates, spline_filter
 from scipy.special import roots_hermitenorm
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design, build_spec, make_start_state
 from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError, UavctlError
 from uavctl.lab.bench.timing import TimedCase, compute_median, time_cases
@@ -34,6 +33,7 @@ from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_design, build_spec, make_start_state
 
 _MAX_AGE = 7  # larger ages count as this one; they have a probability of 0.3^8
 _N_NODES = 7  # of the Gaussian quadrature, in each direction

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from logs.report.statistics import chi2_quantile
 from uavctl.arrays import Array
-from uavctl.build.controller import build_plant, build_problem, make_start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
@@ -33,6 +32,7 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.controller import build_plant, build_problem, make_start_state
 
 # Rounding of the QPs; a plan that misses its end does so by far more.
 _TERMINAL_TOLERANCE = 1e-6

@@ -18,7 +18,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from uavctl.build.controller import build_envelope, build_plant
 from uavctl.config import Config
 from uavctl.flight.context import read_position, read_velocity
 from uavctl.flight.limits import ZERO
@@ -28,6 +27,7 @@ from uavctl.lab.tune.excitation import MIN_STEP_M, RESERVE_M, SafeBox
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
 from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import build_envelope, build_plant
 
 MIN_BRAKE_SHARE = 0.5  # of the commanded deceleration: the least gain that a tuning adopts
 # The same of a tuned plant: an adopted gain has a standard error of at most 0.1, of which this takes two

@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from uavctl.build.controller import compute_reference_limits
-from uavctl.build.mission import compute_reference_range
 from uavctl.config import Config
 from uavctl.config.mission import FenceConfig, MissionConfig
 from uavctl.config.types import CostConfig
@@ -23,6 +21,8 @@ from uavctl.lab.trial import get_room_limits
 from uavctl.records import Vec3
 from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import compute_reference_limits
+from uavctl.wiring.mission import compute_reference_range
 
 DOWN = 2
 RESERVE_M = 0.15  # between the fence's reserve and a waypoint: gusts

@@ -4,10 +4,10 @@ import numpy as np
 from own_parts.controller import Careful
 from own_parts.source import Lines
 
-from uavctl.build.controller import build_problem
 from uavctl.config import load_config
 from uavctl.io.camera import BodyPose, Echo
 from uavctl.smpc.outside import OutsideSolver
+from uavctl.wiring.controller import build_problem
 
 
 def test_a_plan_steers_to_the_target() -> None:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from baseline_rig import problem
 
-import uavctl.build.outside as outside
-from uavctl.build.controller import build_controller, build_flight_design, build_problem
+import uavctl.wiring.outside as outside
 from uavctl.config import load_config
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.spec import check_kind, make_controller
 from uavctl.records import SolveStatus
+from uavctl.wiring.controller import build_controller, build_flight_design, build_problem
 
 MODULE = """
 import numpy as np

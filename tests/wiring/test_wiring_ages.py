@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned
-from uavctl.build.link import build_ages, build_delayed_link
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.draws import draw
+from uavctl.wiring.controller import build_conditioned
+from uavctl.wiring.link import build_ages, build_delayed_link
 
 RUNS, STEPS, OLDEST = 20_000, 80, 12
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from uavctl.build.outside import compute_code_id
+from uavctl.wiring.outside import compute_code_id
 
 
 def test_the_hash_follows_the_sources(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from sim.simulation import World
-from uavctl.build.controller import build_conditioned, build_controller
-from uavctl.build.rehearsal import LARGE_DRAG_1PS, RehearsalResult, rehearse
 from uavctl.config import Config, load_config
 from uavctl.lab.figure_eight import make_figure_eight
 from uavctl.lab.trial import FlightCounts, TrackedFlyer, compute_distances_m, make_path
 from uavctl.loop import ControlLoop
+from uavctl.wiring.controller import build_conditioned, build_controller
+from uavctl.wiring.rehearsal import LARGE_DRAG_1PS, RehearsalResult, rehearse
 
 BURSTS = ("link.model=gilbert-elliott", "link.loss=0.0", "link.burst_loss=1.0")
 LONG = (*BURSTS, "link.burst_enter=0.05", "link.burst_leave=0.1")  # a burst lasts half a second in the mean

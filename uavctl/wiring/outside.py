@@ -30,7 +30,7 @@ from uavctl.smpc.plant import digest
 def compute_code_id() -> str:
     """Return the hash of the code that makes a flight's records: from bytes to estimate, plan, decision and bytes."""
     return digest(
-        tuple(read_sources(f"uavctl{name}") for name in ("", ".build", ".config", ".flight", ".mavlink", ".smpc"))
+        tuple(read_sources(f"uavctl{name}") for name in ("", ".config", ".flight", ".mavlink", ".smpc", ".wiring"))
     )
 
 

@@ -17,8 +17,6 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_plant, make_start_state
-from uavctl.build.mission import sample_trajectory
 from uavctl.config.types import Config
 from uavctl.flight.controller import Controller
 from uavctl.flight.mission import Mission, advance_mission, make_question
@@ -26,6 +24,8 @@ from uavctl.records import Vector
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.design import ConditionedDesign
 from uavctl.smpc.plant import AXES, Plant
+from uavctl.wiring.controller import build_plant, make_start_state
+from uavctl.wiring.mission import sample_trajectory
 
 MAX_STEPS = 2400  # two minutes at steps of 0.05 s; a step takes milliseconds
 # Multiples of the golden ratio modulo 1 fill [0, 1) evenly in any number of steps (Weyl's equidistribution).

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.build.controller import build_controller, build_design, build_plant, build_solver, build_spec
 from uavctl.config import load_config, presets
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
+from uavctl.wiring.controller import build_controller, build_design, build_plant, build_solver, build_spec
 
 
 def test_the_paper_s_plant_is_as_printed() -> None:

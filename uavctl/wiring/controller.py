@@ -14,10 +14,6 @@ import numpy as np
 from uavctl import __version__
 from uavctl.arithmetic import ARITHMETIC
 from uavctl.arrays import SECOND_NS, Array
-from uavctl.build.link import build_ages, build_delayed_link, compute_late_steps, compute_promised_probability
-from uavctl.build.mission import build_mission, build_names, build_reference_limits
-from uavctl.build.outside import build_outside_solver, compute_code_id, compute_controller_id
-from uavctl.build.rest import check_axes, compute_target_equilibrium
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
@@ -38,6 +34,10 @@ from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.link import build_ages, build_delayed_link, compute_late_steps, compute_promised_probability
+from uavctl.wiring.mission import build_mission, build_names, build_reference_limits
+from uavctl.wiring.outside import build_outside_solver, compute_code_id, compute_controller_id
+from uavctl.wiring.rest import check_axes, compute_target_equilibrium
 
 # The paper's scheme is loaded only if it flies: loading it takes a tenth of the time of all other imports.
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from sim.channel import Channel
-from uavctl.build.controller import build_design, build_spec
-from uavctl.build.link import PacketCounts, build_link, compute_promised_probability, count_packets_per_step
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
+from uavctl.wiring.controller import build_design, build_spec
+from uavctl.wiring.link import PacketCounts, build_link, compute_promised_probability, count_packets_per_step
 
 BURSTS = ["link.model=gilbert-elliott", "link.burst_enter=0.1", "link.burst_leave=0.4", "link.burst_loss=0.8"]
 RUNS = ["link.model=empirical", "link.gaps=[0.7, 0.1, 0.05, 0.15]"]
