@@ -106,6 +106,11 @@ class _ChannelStream:
         budget: Bounds what is kept.
     """
 
+    __slots__ = (
+        *("_budget", "_is_requested", "_is_unreadable", "_pieces", "_probe", "_reason", "_unreadable", "_unwrap"),
+        *("encoding", "kind", "messages", "topic"),
+    )  # no dictionary each: a file may have a channel for every 60 bytes
+
     def __init__(
         self,
         channel: Channel,
@@ -259,7 +264,8 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
         ExcessError: A record asks for more than the budget has; names its offset.
     """
     schemas: dict[int, Schema] = {}
-    unwrappers: dict[int, dict[str, Unwrapper | None]] = {}  # by schema, and encoding of messages
+    # By the content of a schema, and the encoding of messages: a recorder may repeat a schema for each topic.
+    unwrappers: dict[tuple[str, str, bytes, str], Unwrapper | None] = {}
     budget = ReadBudget(size)
     try:
         for record in read_records(file, size, budget):
@@ -270,17 +276,20 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
             elif isinstance(record, Schema):
                 if schemas.get(record.id) != record:
                     budget.keep(len(record.name) + len(record.data))
-                    schemas[record.id], unwrappers[record.id] = record, {}
+                    schemas[record.id] = record
             elif record.id not in streams:
                 budget.keep(_PIECE_BYTES + len(record.topic) + len(record.message_encoding))
                 schema, encoding = schemas.get(record.schema_id), record.message_encoding
-                of_schema = unwrappers.get(record.schema_id, {})
-                if schema is not None and encoding not in of_schema:
-                    of_schema[encoding] = make_unwrapper(encoding, schema.encoding, schema.name, schema.data)
-                    if of_schema[encoding] is not None:
-                        budget.keep(DEFINITION_RATIO * len(schema.data))
+                unwrap: Unwrapper | None = None
+                if schema is not None:
+                    content = schema.encoding, schema.name, schema.data, encoding
+                    if content not in unwrappers:
+                        unwrappers[content] = make_unwrapper(encoding, schema.encoding, schema.name, schema.data)
+                        if unwrappers[content] is not None:
+                            budget.keep(DEFINITION_RATIO * len(schema.data))
+                    unwrap = unwrappers[content]
                 streams[record.id] = _ChannelStream(
-                    record, schema, of_schema.get(encoding), is_requested=record.topic in topics, budget=budget
+                    record, schema, unwrap, is_requested=record.topic in topics, budget=budget
                 )
     except TornError:
         return True

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Mapping
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ROS1, ROS2 = "ros1", "cdr"  # encodings of messages
@@ -50,14 +50,37 @@ _MAVLINK_FIELDS = frozenset(("magic", "len", "seq", "sysid", "compid", "msgid", 
 Value = int | float | bytes | list["Value"] | dict[str, "Value"]
 
 
-class _RosField(NamedTuple):
+class _RosField(msgspec.Struct, frozen=True, gc=False):
+    """Field of a type; the garbage collector passes it over, as it holds nothing but texts and a number."""
+
     type: str
     name: str
     size: int | None  # of an array; 0: as many as the message says; None: no array
 
 
-Definitions = dict[str, list[_RosField]]
-Unwrapper = Callable[[bytes], bytes]  # the frame in a message
+Definitions = dict[str, tuple[_RosField, ...]]
+
+
+class Unwrapper(msgspec.Struct, frozen=True, gc=False):
+    """Reader of the frames in a channel's messages; no part of it leads back to it, so the garbage collector is spared.
+
+    Attributes:
+        types: Fields of each type.
+        top: Type of a message.
+        encoding: Encoding of messages, of ROS 1 or 2.
+    """
+
+    types: Definitions
+    top: str
+    encoding: str
+
+    def __call__(self, data: bytes) -> bytes:
+        """Return the frame in a message.
+
+        Raises:
+            UnreadableError: The message is damaged.
+        """
+        return _make_frame(_RosReader(data, self.types, self.encoding).read_record(self.top))
 
 
 class UnreadableError(Exception):
@@ -65,12 +88,12 @@ class UnreadableError(Exception):
 
 
 def make_unwrapper(encoding: str, schema_encoding: str, name: str, definition: bytes) -> Unwrapper | None:
-    """Return a function that makes a frame of each message of a channel, if they are MAVLink wrapped by ROS.
+    """Make the reader of the messages of a channel, if they are MAVLink wrapped by ROS.
 
     Such messages are known by their fields, those of mavros_msgs/Mavlink, wherever they stand in the definition.
 
     Returns:
-        None if they are something else. The function raises `UnreadableError` for a message that is damaged.
+        None if they are something else.
     """
     if _DEFINITIONS.get(encoding) != schema_encoding or len(definition) > _MAX_DEFINITION_BYTES:
         return None
@@ -84,10 +107,7 @@ def make_unwrapper(encoding: str, schema_encoding: str, name: str, definition: b
     if not _MAVLINK_FIELDS.issubset(field.name for field in types[top]):
         return None
 
-    def unwrap(data: bytes) -> bytes:
-        return _make_frame(_RosReader(data, types, encoding).read_record(top))
-
-    return unwrap
+    return Unwrapper(types, top, encoding)
 
 
 def _normalise_type_name(name: str) -> str:
@@ -106,7 +126,7 @@ def _parse_definition(top: str, text: str) -> Definitions:
             if not lines or not lines[0].startswith("MSG:"):
                 raise UnreadableError("a definition without its name")
             owner = _normalise_type_name(lines.pop(0).removeprefix("MSG:").strip())
-        types[owner] = [field for line in lines if (field := _parse_field(line, owner)) is not None]
+        types[owner] = tuple([field for line in lines if (field := _parse_field(line, owner)) is not None])
     return types
 
 
@@ -132,7 +152,7 @@ class _RosReader:
     A definition may nest types that have no bytes, or lists of them: the steps of reading are bounded.
     """
 
-    def __init__(self, data: bytes, types: Mapping[str, list[_RosField]], encoding: str) -> None:
+    def __init__(self, data: bytes, types: Definitions, encoding: str) -> None:
         self._types, self._cdr = types, encoding == ROS2
         self._order, self._max_alignment = "<", 1
         self._at, self._data = 0, data

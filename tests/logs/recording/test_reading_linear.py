@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from work_rig import count_lines
 
 from logs.recording.file_scan import scan_file
 from logs.recording.foreign import read_mcap
+from logs.recording.mavros import make_unwrapper
 from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.config.document import find_excess, find_key_lines, read_text
@@ -119,3 +121,38 @@ def test_ten_times_the_file_takes_at_most_twelve_times_the_work(name: str, tmp_p
     make(long, 3000)
     read(short)  # what is done once for all files
     assert count_lines(lambda: read(long)) <= 12 * count_lines(lambda: read(short))
+
+
+def count_tracked(definition: str) -> int:
+    """Count the objects of a parsed definition that the garbage collector looks at again and again."""
+    unwrap = make_unwrapper("ros1", "ros1msg", "pkg/Top", definition.encode())
+    assert unwrap is not None
+    gc.collect()  # it leaves tuples of plain values out from then on
+    seen: set[int] = set()
+    left: list[object] = [unwrap]
+    while left:
+        one = left.pop()
+        if id(one) not in seen and not isinstance(one, type):
+            seen.add(id(one))
+            left += gc.get_referents(one)
+            left += [getattr(one, name) for name in getattr(one, "__struct_fields__", ())]
+    return sum(gc.is_tracked(one) for one in gc.get_objects() if id(one) in seen)
+
+
+def test_the_garbage_collector_looks_at_no_field_of_a_definition() -> None:
+    few = files.MAVLINK_FIELDS
+    many = few + "".join(f"uint8[4] field{number}\n" for number in range(200))
+    assert count_tracked(many) == count_tracked(few) <= 1
+
+
+def test_a_definition_that_is_repeated_is_parsed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[bytes] = []
+
+    def make(encoding: str, schema_encoding: str, name: str, definition: bytes) -> object:
+        parsed.append(definition)
+        return make_unwrapper(encoding, schema_encoding, name, definition)
+
+    monkeypatch.setattr("logs.recording.foreign.make_unwrapper", make)
+    make_ros_schemas(tmp_path / "file", 300)
+    assert read_mcap(tmp_path / "file").packets
+    assert len(parsed) == 1
