@@ -25,7 +25,7 @@ from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.lab.tune.box_monitor import BoxMonitor
-from uavctl.lab.tune.run_folder import find_last_waypoint_steps
+from uavctl.lab.tune.figures import find_last_waypoint_steps
 from uavctl.mavlink.connection import MavlinkConnection, make_links
 from uavctl.records import PositionSample, Vec3, VehicleStatus
 from uavctl.smpc.plant import AXES

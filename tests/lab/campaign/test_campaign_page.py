@@ -263,7 +263,7 @@ def test_a_page_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
 
 def test_the_reason_of_a_refused_cell_is_a_row_over_all_columns(grid: Path) -> None:
     html = (grid / "report.html").read_text(encoding="utf-8")
-    assert len(re.findall(rf'<tr><td colspan="14">2 far: [^<]*{REFUSED}</td></tr>', html)) == 1
+    assert len(re.findall(rf'<tr><td colspan="15">2 far: [^<]*{REFUSED}</td></tr>', html)) == 1
     assert "min-width:97" not in html  # no table is set wider than the paper
 
 

@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from campaign_results import STEPS, cell, runs, write
-from ratios import paired_ratio
 from scipy.optimize import brentq
 from scipy.stats import binom
 
@@ -160,6 +159,13 @@ def test_the_worst_step_is_that_of_all_runs_together(tmp_path: Path) -> None:
     assert unknown.worst_step_rate is None
 
 
+def test_settled_steps_are_those_of_the_second_half(tmp_path: Path) -> None:
+    early, late = [1] * (STEPS // 2), [0] * (STEPS // 2) + [1, 1, 0, 1]
+    rows = runs(0, [1.0] * 4, state_violations=[STEPS // 2, 3, 0, 0], outside=[early, late, [], []])
+    (one,) = summarise(write(tmp_path, [cell(0, "smpc", "smpc")], rows))
+    assert one.settled_violation_rate == pytest.approx(3 / (4 * STEPS // 2))
+
+
 def test_results_of_a_small_folder(tmp_path: Path) -> None:
     nan = float("nan")
     folder = write(
@@ -276,21 +282,3 @@ def test_the_rows_of_one_cell_are_in_memory_at_a_time(tmp_path: Path) -> None:
         return max(sizes)
 
     assert peak_bytes(20) < 3 * peak_bytes(2)
-
-
-def test_a_ratio_of_means_has_the_interval_of_resampled_pairs() -> None:
-    rng = np.random.default_rng(6)
-    common = rng.gamma(4.0, size=500)
-    a, b = common + 0.1 * rng.normal(size=500), 1.25 * common + 0.1 * rng.normal(size=500)
-    ratio, (low, high) = paired_ratio(a, b)
-    indices = rng.integers(0, 500, (4000, 500))
-    expected = np.quantile(a[indices].mean(axis=1) / b[indices].mean(axis=1), [0.025, 0.975])
-    assert ratio == pytest.approx(a.mean() / b.mean())
-    assert (low, high) == pytest.approx(tuple(expected), abs=0.1 * (expected[1] - expected[0]))
-    assert high - low < 0.02  # each mean by itself is known to 9 %
-
-
-def test_there_is_no_ratio_to_nothing() -> None:
-    for b in (np.zeros(3), np.zeros(0)):
-        with pytest.raises(UsageError, match="mean of zero"):
-            paired_ratio(b, b)

@@ -1,19 +1,12 @@
-"""A flight of the true vehicle: what is counted, what is believed, and what the tool tells of it."""
+"""A flight of the true vehicle: what is counted, what is believed."""
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from places import ROOT
-
-sys.path.insert(0, str(ROOT / "tools"))
-
-import trials
 
 from uavctl.lab.figure_eight import make_figure_eight
 from uavctl.lab.position_loop import PositionLoopTuning
@@ -156,30 +149,3 @@ def test_an_eight_is_tracked_along_its_own_time() -> None:
     assert 0.0 < result.tracking_m < result.tracking_max_m < 0.6
     assert math.isnan(result.hold_rms_m)
     assert get_flight_length_s("eight", 1.0) > make_figure_eight().times_s[-1]
-
-
-@pytest.mark.slow
-def test_the_tool_writes_every_flight_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = "--pilots own own-tuned --autopilots px4 --seeds 2 --rates 10 --losses 0.3 --seconds 6 --from 4 --json"
-    assert trials.main(arguments.split()) == 0
-    cells = json.loads(capsys.readouterr().out)["cells"]
-    assert [cell["pilot"]["name"] for cell in cells] == ["own", "own-tuned"]
-    for cell in cells:
-        assert [flight["seed"] for flight in cell["flights"]] == [0, 1]
-        worst = max(flight["hold_rms_m"] for flight in cell["flights"])
-        assert cell["worst"]["hold_rms_m"] == worst >= cell["median"]["hold_rms_m"]
-        assert cell["flights"][0]["limited"] is None
-
-
-def test_the_tool_reports_why_no_controller_flies(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--pilots", "--variant", "long", "smpc.scheme=age-conditioned", "smpc.horizon=4"]
-    assert trials.main([*arguments, "--autopilots", "px4", "--rates", "5", "--losses", "0.6", "--seeds", "1"]) == 1
-    assert "refused" in capsys.readouterr().out
-
-
-def test_variants_and_configurations_are_separate_pilots() -> None:
-    arguments = ["--config", "room", "paper", "--pilots", "configured", "own", "--set", "cost.input=[1]"]
-    parsed = trials._parser().parse_args([*arguments, "--variant", "deep", "smpc.horizon=16"])
-    named = {pilot.name: pilot for pilot in trials.pilots(parsed, AUTOPILOTS[0])}
-    assert list(named) == ["room", "room: deep", "paper", "paper: deep", "own"]
-    assert named["room: deep"].overrides == ("cost.input=[1]", "smpc.horizon=16")

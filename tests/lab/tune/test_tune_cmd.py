@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,26 +11,25 @@ from pathlib import Path
 import pytest
 from tune_rig import BOX, START, make_arguments, run_command, short_flights
 
-from logs.recording.reader import find_segments, read_header
+from logs.recording.flight import FlightData
+from logs.recording.reader import find_segments, read, read_header
 from uavctl.cli import loopback as loopback_cmd
-from uavctl.cli import tune as tune_cmd
+from uavctl.cli import tune_run
 from uavctl.cli.app import run
 from uavctl.cli.tune_flights import find_complete_flight
-from uavctl.config import Config, load_config
-from uavctl.config.load import parse
-from uavctl.lab.tune.excitation import parse_box
-from uavctl.lab.tune.run_folder import (
+from uavctl.cli.tune_run import (
     AFTER_FOLDER,
     BEFORE_FOLDER,
     FIT_PAGE_FILE,
     PAGE_FILE,
     SETTINGS_FILE,
-    STATE_FILE,
     TUNED_FILE,
-    TuneFolder,
-    TuneSettings,
-    lock_run,
+    TuneExit,
 )
+from uavctl.config import Config, load_config
+from uavctl.config.load import dump_config, parse
+from uavctl.errors import UsageError
+from uavctl.lab.tune.excitation import parse_box
 
 PILOT = 'sim.fault=[{at_s=6.0,kind="mode",name="POSCTL"}]'
 
@@ -54,30 +52,34 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     folder = tmp_path / "begun"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tune_cmd, "fly_once", pressed)
-        assert run(make_arguments(folder, "--set", "log.segment_bytes=1000000")) == tune_cmd.INTERRUPTED
-    monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown"))
+        patch.setattr(tune_run, "fly_once", pressed)
+        assert run(make_arguments(folder, "--set", "log.segment_bytes=1000000")) == TuneExit.INTERRUPTED
+    monkeypatch.setattr(tune_run, "fly_once", lambda *_, **__: pytest.fail("flown"))
     return folder
+
+
+@pytest.fixture
+def no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tune_run, "fly_once", lambda *_, **__: pytest.fail("flown"))
+
+
+def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, str]:
+    """The same command on a folder."""
+    with short_flights():
+        return run_command(capsys, *make_arguments(folder, "--set", "log.segment_bytes=1000000", "--json"))
 
 
 @pytest.mark.slow
 def test_a_run_leaves_flights_configuration_and_pages(finished_run: Path) -> None:
-    for name in (TUNED_FILE, PAGE_FILE, FIT_PAGE_FILE, STATE_FILE):
+    for name in (TUNED_FILE, PAGE_FILE, FIT_PAGE_FILE, SETTINGS_FILE):
         assert (finished_run / name).is_file()
-    state = json.loads((finished_run / STATE_FILE).read_text())
-    before, after = state["comparison"]["before"], state["comparison"]["after"]
-    assert before["hold_s"] > 2.0 and after["hold_s"] > 2.0
-    assert after["beyond_box_m"] < 0.0 and before["beyond_box_m"] < 0.0
-    new, old = (state["comparison"][key]["rms_m"] for key in ("new_errors", "old_errors"))
-    assert new[0][3] < 0.7 * old[0][3] and new[1][3] < 0.7 * old[1][3]
 
 
 @pytest.mark.slow
 def test_all_files_of_a_recording_are_read(finished_run: Path) -> None:
     first = finished_run / BEFORE_FOLDER / "flight.mcap"
     assert len(find_segments(first)) > 1
-    state = json.loads((finished_run / STATE_FILE).read_text())
-    assert state["comparison"]["before"]["flown_s"] > 25.0
+    assert len(FlightData.from_records(read(first), first).steps) > 500  # of 0.05 s
 
 
 @pytest.mark.slow
@@ -95,58 +97,44 @@ def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(fini
 
 
 @pytest.mark.slow
-def test_every_figure_of_the_page_has_a_text_alternative(finished_run: Path) -> None:
-    page = (finished_run / PAGE_FILE).read_text()
-    figures = re.findall(r'<figure id="([\w-]+)"', page)
-    assert {"held", "growing-first", "growing-second", "motion-north", "motion-east", "motion-down"} <= set(figures)
-    assert page.count('aria-label="') >= len(figures)
-
-
-@pytest.mark.slow
+@pytest.mark.usefixtures("no_flight")
 def test_a_run_that_is_done_flies_no_more(finished_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamp = (finished_run / STATE_FILE).read_bytes()
-    with short_flights():
-        code, out, _ = run_command(
-            capsys, *make_arguments(finished_run, "--set", "log.segment_bytes=1000000", "--json")
-        )
-    assert code == 0
+    stamp = (finished_run / TUNED_FILE).read_bytes()
+    code, out, _ = again(capsys, finished_run)
     document = json.loads(out)
-    assert document["config"] == str(finished_run / TUNED_FILE) and document["stopped"] == ""
-    assert (finished_run / STATE_FILE).read_bytes() == stamp
-    assert not (finished_run / f"{BEFORE_FOLDER}-2").exists() and not (finished_run / f"{AFTER_FOLDER}-2").exists()
+    assert code == 0 and document["stopped"] == "" and document["config"] == str(finished_run / TUNED_FILE)
+    first, second = document["figures"]
+    assert first["beyond_box_m"] < 0.0 and second["beyond_box_m"] < 0.0
+    old_m, new_m = document["prediction_m"]
+    assert new_m < 0.7 * old_m and second["hold_rms_m"] < 0.1
+    assert (finished_run / TUNED_FILE).read_bytes() == stamp
 
 
 @pytest.mark.slow
-def test_a_run_continues_after_the_last_complete_step(
-    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.usefixtures("no_flight")
+def test_complete_flights_count_without_the_rest(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    state = json.loads((finished_run / STATE_FILE).read_text())
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / STATE_FILE).write_text(
-        json.dumps(
-            {
-                **state,
-                "before": str(finished_run / state["before"]),
-                "after": str(finished_run / state["after"]),
-                "comparison": None,
-            }
-        )
-    )
-    (folder / TUNED_FILE).write_bytes((finished_run / TUNED_FILE).read_bytes())
-    monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown again"))
-    with short_flights():
-        code, _, _ = run_command(capsys, *make_arguments(folder, "--set", "log.segment_bytes=1000000"))
-    assert code == 0
-    again = json.loads((folder / STATE_FILE).read_text())["comparison"]
-    assert again["new_errors"] == state["comparison"]["new_errors"]
-    assert (folder / PAGE_FILE).is_file()
+    folder = tmp_path / "copy"
+    shutil.copytree(finished_run, folder)
+    for name in (TUNED_FILE, PAGE_FILE):
+        (folder / name).unlink()
+    code, out, _ = again(capsys, folder)
+    assert (code, json.loads(out)["stopped"]) == (0, "")
+    assert (folder / TUNED_FILE).read_text() == (finished_run / TUNED_FILE).read_text()
 
 
 def test_another_configuration_is_refused_by_its_key(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = run_command(capsys, *make_arguments(begun))
     assert (code, out) == (2, "")
     assert "log.segment_bytes" in err
+
+
+def test_another_box_is_refused(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--box=-1.1,-1.1,-2,1.2,1.1,-0.4" if one == BOX else one for one in make_arguments(begun)]
+    with short_flights():
+        code, _, err = run_command(capsys, *arguments, "--set", "log.segment_bytes=1000000")
+    assert code == 2 and "fence" in err
 
 
 @pytest.mark.slow
@@ -163,11 +151,11 @@ def test_the_pilots_stick_stops_the_run_and_the_next_try_is_a_new_flight(
     with short_flights():
         code, out, err = run_command(capsys, *make_arguments(folder, "--set", PILOT, "--json"))
         document = json.loads(out)
-        assert code == document["exit_code"] == tune_cmd.PILOT
+        assert code == document["exit_code"] == TuneExit.PILOT
         assert document["before"] == "" and document["config"] is None
         assert "pilot" in document["stopped"].lower() and str(folder) in err
-        monkeypatch.setattr(tune_cmd, "fly_once", pressed)
-        assert run(make_arguments(folder, "--set", PILOT)) == tune_cmd.INTERRUPTED
+        monkeypatch.setattr(tune_run, "fly_once", pressed)
+        assert run(make_arguments(folder, "--set", PILOT)) == TuneExit.INTERRUPTED
     assert (folder / BEFORE_FOLDER / "flight.mcap").exists() and tries == [folder / f"{BEFORE_FOLDER}-2"]
     assert not (folder / TUNED_FILE).exists()
 
@@ -186,7 +174,7 @@ def test_ctrl_c_ends_the_flight_and_the_run(
     with short_flights():
         code, out, _ = run_command(capsys, *make_arguments(folder, "--json"))
     document = json.loads(out)
-    assert code == document["exit_code"] == tune_cmd.INTERRUPTED
+    assert code == document["exit_code"] == TuneExit.INTERRUPTED
     assert document["before"] == "" and "operator" in document["stopped"]
     assert (folder / BEFORE_FOLDER / "flight.mcap").exists()
 
@@ -202,10 +190,10 @@ def test_a_recording_takes_the_place_of_the_first_flight(
         requests.append(config)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tune_cmd, "fly_once", pressed)
+    monkeypatch.setattr(tune_run, "fly_once", pressed)
     arguments = ["tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback", "--set", START]
     code, out, _ = run_command(capsys, *arguments, "--json")
-    assert code == tune_cmd.INTERRUPTED
+    assert code == TuneExit.INTERRUPTED
     document = json.loads(out)
     assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED_FILE)
     assert not (folder / BEFORE_FOLDER).exists()
@@ -243,46 +231,7 @@ def test_invalid_arguments_are_refused_before_a_folder_is_made(
 def test_without_a_terminal_the_answer_is_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     requests = iter(["", "\n"])
     monkeypatch.setattr("sys.stdin.readline", lambda: next(requests), raising=False)
-    assert [tune_cmd.ask_agreement(), tune_cmd.ask_agreement()] == [False, True]
-
-
-@pytest.fixture
-def copy(finished_run: Path, tmp_path: Path) -> Callable[..., Path]:
-    """The run as it was before some of its steps were noted."""
-
-    def make(**noted: object) -> Path:
-        folder = tmp_path / "copy"
-        shutil.copytree(finished_run, folder)
-        state = json.loads((folder / STATE_FILE).read_text())
-        (folder / STATE_FILE).write_text(json.dumps({**state, "comparison": None, **noted}))
-        return folder
-
-    return make
-
-
-@pytest.fixture
-def no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown"))
-
-
-def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, str]:
-    """The same command on a folder."""
-    with short_flights():
-        return run_command(capsys, *make_arguments(folder, "--set", "log.segment_bytes=1000000", "--json"))
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_flight")
-def test_complete_flights_count_without_a_note(
-    copy: Callable[..., Path], finished_run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = copy(before="", after="", tuned=None)
-    code, out, _ = again(capsys, folder)
-    document = json.loads(out)
-    assert (code, document["stopped"]) == (0, "")
-    state = json.loads((finished_run / STATE_FILE).read_text())
-    assert (document["before"], document["after"]) == (state["before"], state["after"])
-    assert document["comparison"]["new_errors"] == state["comparison"]["new_errors"]
+    assert [tune_run.ask_agreement(), tune_run.ask_agreement()] == [False, True]
 
 
 @pytest.mark.slow
@@ -300,62 +249,44 @@ def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(
     assert find_complete_flight(config, tmp_path) is None
 
 
-def test_an_incomplete_tuned_configuration_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    errors: dict[str, list[float]] = {"axes": [], "ahead_s": [], "rms_m": []}
-    ranges = {"dead_time_range_s": [0.0, 0.1], "old_errors": errors, "new_errors": errors}
-    link = {"link_loss": 0.0, "link_bursts": False, "link_delay_s": 0.0, "link_jitter_s": 0.0}
-    noted = {"before": "before/flight.mcap", "tuned": {"changes": [], "warnings": [], **ranges, **link}}
-    state = json.loads((begun / STATE_FILE).read_text())
-    (begun / STATE_FILE).write_text(json.dumps({**state, **noted}))
-    lines = (begun / SETTINGS_FILE).read_text().splitlines(keepends=True)
-    cut = "".join(lines[: len(lines) // 2])
-    (begun / TUNED_FILE).write_text(cut)
-    code, out, err = again(capsys, begun)
-    assert (code, json.loads(out)["exit_code"]) == (2, 2) and str(begun / TUNED_FILE) in " ".join(err.split())
-    assert (begun / TUNED_FILE).read_text() == cut and not (begun / AFTER_FOLDER).exists()
+def test_an_incomplete_tuned_configuration_is_not_read(tmp_path: Path) -> None:
+    file = tmp_path / TUNED_FILE
+    whole = dump_config(load_config("room")).splitlines(keepends=True)
+    file.write_text("".join(whole))
+    assert tune_run.read_tuned(file) == load_config("room")
+    file.write_text("".join(line for line in whole if not line.startswith("jitter_s")))
+    with pytest.raises(UsageError, match="jitter_s is missing"):
+        tune_run.read_tuned(file)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
 def test_ctrl_c_outside_a_flight_keeps_finished_steps(
-    copy: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def pressed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    folder = copy(after="", tuned=None)
-    monkeypatch.setattr(tune_cmd, "identify", pressed)
+    folder = tmp_path / "copy"
+    shutil.copytree(finished_run, folder)
+    (folder / TUNED_FILE).unlink()
+    monkeypatch.setattr(tune_run, "identify", pressed)
     code, out, err = again(capsys, folder)
     document = json.loads(out)
-    assert code == document["exit_code"] == tune_cmd.INTERRUPTED
+    assert code == document["exit_code"] == TuneExit.INTERRUPTED
     assert document["stopped"] and document["before"] and str(folder) in " ".join(err.split())
-
-
-def test_a_second_run_in_the_same_folder_is_refused(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamp = (begun / STATE_FILE).read_bytes()
-    with lock_run(begun):
-        code, out, err = again(capsys, begun)
-    assert (code, json.loads(out)["exit_code"]) == (2, 2) and "--folder" in err
-    assert (begun / STATE_FILE).read_bytes() == stamp
-
-
-def test_a_full_folder_is_reported_before_a_flight(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamp = (begun / STATE_FILE).read_bytes()
-    (begun / f"{STATE_FILE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
-    code, out, err = again(capsys, begun)
-    assert (code, json.loads(out)["exit_code"]) == (1, 1) and STATE_FILE in err
-    assert (begun / STATE_FILE).read_bytes() == stamp
 
 
 def test_a_folder_interrupted_at_its_first_file_restarts(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / f"{STATE_FILE}.part").write_text("{")
-    requests = TuneSettings(box="b", flight="", simulated=True, take_off_m=None)
-    TuneFolder.open(folder, load_config("room"), requests)
-    (folder / SETTINGS_FILE).unlink()
-    TuneFolder.open(folder, load_config("room"), requests)
-    assert (folder / STATE_FILE).is_file() and (folder / SETTINGS_FILE).is_file()
+    (folder / f"{SETTINGS_FILE}.part").write_text("half")
+    tune_run.open_folder(folder, load_config("room"))
+    assert (folder / SETTINGS_FILE).is_file()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="no run"):
+        tune_run.open_folder(tmp_path / "other", load_config("room"))
 
 
 @pytest.mark.parametrize("content", [b"", b"no recording", b"\x89MCAP0\r\n"])
@@ -392,7 +323,6 @@ def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.Capture
         code, out, _ = run_command(capsys, *make_arguments(folder, "--set", "sim.autopilot=ardupilot", "--json"))
     document = json.loads(out)
     assert (code, document["stopped"]) == (0, "")
-    comparison = document["comparison"]
-    new, old = (comparison[key]["rms_m"] for key in ("new_errors", "old_errors"))
-    assert new[0][3] < 0.9 * old[0][3] and new[1][3] < 0.9 * old[1][3]
-    assert comparison["after"]["beyond_box_m"] < 0.0 and comparison["after"]["hold_s"] > 2.0
+    first, second = document["figures"]
+    old_m, new_m = document["prediction_m"]
+    assert first["beyond_box_m"] < 0.0 and second["beyond_box_m"] < 0.0 and new_m < 0.7 * old_m

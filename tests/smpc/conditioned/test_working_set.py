@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from drawn_questions import draw_questions
 
 from uavctl.config import load_config
-from uavctl.lab.bench.run import draw_questions
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.working_set import WorkingSetGuess

@@ -1,1 +1,1 @@
-"""Speed of decisions and of the control loop on this machine."""
+"""Speed of this machine: one decision, one tick."""

@@ -366,8 +366,9 @@ def _make_path_section(view: CampaignView) -> Iterator[PageSection]:
 
 
 _CELL_COLUMNS = (
-    "cell", "controller", "cost of a run", "settled, a step", "states outside", "worst step", "runs with any",
-    "inputs outside", "mean square input", "no plan left", "no plan found", "limits eased", "oldest", "failed",
+    "cell", "controller", "cost of a run", "settled, a step", "states outside", "settled, outside", "worst step",
+    "runs with any", "inputs outside", "mean square input", "no plan left", "no plan found", "limits eased",
+    "oldest", "failed",
 )  # fmt: skip
 
 
@@ -379,10 +380,10 @@ def _make_cells_section(view: CampaignView) -> PageSection:
         body = page.render_table(_CELL_COLUMNS, rows, frozenset(range(len(_CELL_COLUMNS))) - {1}, refused, kind="dense")
         tables.append(page.render_folded(view.name_group(group), body))
     note = (
-        "States and inputs outside: share of steps. Worst step: share of runs with a state outside in the step with "
-        "the most, its exact interval for all steps at once (Bonferroni). Runs with any: share of runs with a state "
-        "outside. No plan left: steps in which the SMPC braked. No plan found, limits eased: decisions. Oldest: "
-        "largest age in steps."
+        "States and inputs outside: share of steps. Settled: second half of the runs. Worst step: share of runs with a "
+        "state outside in the step with the most, its exact interval for all steps at once (Bonferroni). Runs with "
+        "any: share of runs with a state outside. No plan left: steps in which the SMPC braked. No plan found, limits "
+        "eased: decisions. Oldest: largest age in steps."
     )
     return PageSection("All figures", note, page.join(tables))
 
@@ -395,6 +396,7 @@ def _make_row(cell: CellSummary) -> tuple[str, ...]:
         _format_mean(cell.cost, cell.cost_ci),
         _format_mean(cell.settled_cost, cell.settled_cost_ci),
         _format_rate(cell.violation_rate, cell.violation_ci),
+        format_percent(cell.settled_violation_rate),
         _format_rate(cell.worst_step_rate, cell.worst_step_ci),
         _format_rate(cell.run_violation_rate, cell.run_violation_ci),
         _format_rate(cell.input_violation_rate, cell.input_violation_ci),

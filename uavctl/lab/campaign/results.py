@@ -310,6 +310,7 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     usable_room: float | None = None  # share of it in which a plan may rest
     worst_step_rate: float | None = None  # share of runs with a state outside, in the step with the most
     worst_step_ci: Interval | None = None  # for all steps at once, see `max_step_rate`
+    settled_violation_rate: float | None = None  # share of steps with a state outside, second half of the runs
 
 
 def summarise(folder: Path) -> list[CellSummary]:
@@ -332,6 +333,7 @@ def summarise_cell(results: Results, cell: CellFigures) -> CellSummary:
     gaps = runs["largest_gap"][np.isfinite(runs["largest_gap"])]
     has_outside_counts = n > 0 and (runs.outside.sum() > 0 or not runs["state_violations"].any())
     worst = max_step_rate(runs.outside, n, results.steps) if has_outside_counts else (None, None)
+    settled_outside = runs.outside[results.steps // 2 :]
     (ages,) = np.nonzero(runs.ages)
     summary_fields = CellSummary.__struct_fields__
     shared_fields: dict[str, Any] = {
@@ -361,6 +363,9 @@ def summarise_cell(results: Results, cell: CellFigures) -> CellSummary:
         beyond_m=_compute_finite(np.max, runs["beyond_m"]),
         worst_step_rate=worst[0],
         worst_step_ci=worst[1],
+        settled_violation_rate=(
+            float(settled_outside.sum() / (n * (results.steps - results.steps // 2))) if has_outside_counts else None
+        ),
     )
 
 

@@ -102,10 +102,10 @@ def make_spreads(
     """
     spreads = []
     for row, axis in enumerate(axes):
-        pairs = _measure_configuration(flown, axis, identified, row, ramp_s)
+        pairs = measure_configuration(flown, axis, identified, row, ramp_s)
         old_pairs: Sequence[tuple[Array, Array] | None] = [None] * len(pairs)
         if before.plant.model == identified.plant.model:
-            old_pairs = _measure_configuration(flown, axis, before, row, ramp_s)
+            old_pairs = measure_configuration(flown, axis, before, row, ramp_s)
         spreads += [
             Spread(
                 axis=identified.plant.axes[row],
@@ -119,9 +119,10 @@ def make_spreads(
     return tuple(spreads)
 
 
-def _measure_configuration(
+def measure_configuration(
     flown: Sequence[Stretch], axis: int, config: Config, row: int, ramp_s: float
 ) -> tuple[tuple[Array, Array], ...]:
+    """Measure errors and standard deviations of the positions that a configuration predicts, see `measure_spreads`."""
     model, values = get_configured_axis(config, row)
     dead_time_s = max(0.0, config.plant.dead_time_s - ramp_s)
     return measure_spreads(flown, axis, model, make_parameters(model, values), dead_time_s)

@@ -22,8 +22,9 @@ from scipy.special import roots_hermitenorm
 from uavctl.arrays import Array
 from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError, UavctlError
-from uavctl.lab.bench.timing import TimedCase, compute_median, time_cases
+from uavctl.lab.bench.decision import time_questions
 from uavctl.lab.paper.claims import PRESET, PRINTED, Complexity, Depth, TriedDesign
+from uavctl.smpc.answer import NOMINAL
 from uavctl.smpc.hahn_stursberg.components import Component, decompose
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
@@ -213,30 +214,31 @@ def _measure_complexity(seed: int, on_step: ReportStep) -> list[Complexity]:
     sizes = [(tau, _HORIZON) for tau in _TAUS] + [
         (tau, tau + _FREE_STAGES) for tau in _TAUS if tau + _FREE_STAGES != _HORIZON
     ]
-    entries, cases = [], []
     points = _draw_points(seed)
+    measured = []
     for tau, horizon in sizes:
         on_step(f"complexity, τ = {tau}, H = {horizon}")
         design = _make_one_axis_design(tau, horizon)
-        if isinstance(design, str):
-            entries.append((tau, horizon, design, 0))
-            continue
-        entries.append((tau, horizon, "", make_horizon(design, decompose(design)[0]).n_theta))
-        cases += [TimedCase(solver, points, design.target) for solver in (ConicSolver(design), PrintedSolver(design))]
-    on_step("complexity, all in turns")
-    times = iter([compute_median(result.us) for result in time_cases(cases, _RUNS)])
-    return [
-        Complexity(
-            tau=tau,
-            horizon=horizon,
-            gains=gains,
-            lifted=(tau + 1) * points[0].size,
-            exact_ms=None if refused else _to_ms(next(times)),
-            printed_ms=None if refused else _to_ms(next(times)),
-            refused=refused,
+        gains, exact_ms, printed_ms = 0, None, None
+        if not isinstance(design, str):
+            gains = make_horizon(design, decompose(design)[0]).n_theta
+            questions = [(x, design.target, NOMINAL) for x in points]
+            exact_ms, printed_ms = (
+                1e-3 * float(np.median(time_questions(solver, questions, _RUNS)))
+                for solver in (ConicSolver(design), PrintedSolver(design))
+            )
+        measured.append(
+            Complexity(
+                tau=tau,
+                horizon=horizon,
+                gains=gains,
+                lifted=(tau + 1) * points[0].size,
+                exact_ms=exact_ms,
+                printed_ms=printed_ms,
+                refused=design if isinstance(design, str) else "",
+            )
         )
-        for tau, horizon, refused, gains in entries
-    ]
+    return measured
 
 
 def _draw_points(seed: int) -> list[Array]:
@@ -256,10 +258,6 @@ def _make_one_axis_design(tau: int, horizon: int) -> Design | str:
     except (ConfigError, DesignError) as error:
         return str(error)
     return extract_component(design, decompose(design)[0])
-
-
-def _to_ms(us: float | None) -> float | None:
-    return None if us is None else us / 1e3
 
 
 def extract_component(design: Design, component: Component) -> Design:
