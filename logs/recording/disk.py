@@ -41,7 +41,6 @@ class DiskFile:
     """
 
     def __init__(self, path: Path) -> None:
-        # What is appended to a file that somebody has cut stays too short, and so can be seen.
         self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
 
     def write(self, data: bytes) -> None:
@@ -75,21 +74,6 @@ def find_later_segments(path: Path) -> tuple[Path, ...]:
     pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
     files_by_number = {int(match[1]): file for file in path.parent.glob("*") if (match := pattern.fullmatch(file.name))}
     return tuple(files_by_number[number] for number in sorted(files_by_number))
-
-
-def is_present(path: Path, size: int, opened: os.stat_result | None = None) -> bool:
-    """Return whether a file is still where it was made, and no shorter than what was written to it.
-
-    Args:
-        opened: status of the file while it is open; of a closed file some file systems (FAT) change the number.
-    """
-    try:
-        status = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError:
-        return True  # nobody knows, and the next write will tell
-    return status.st_size >= size and (opened is None or os.path.samestat(status, opened))
 
 
 def get_free_bytes(folder: Path) -> int | None:

@@ -97,7 +97,6 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     waiting: int  # records in memory
     dropped: int  # records that found the queue full, or came after the end
     refused: int  # records that could not be encoded
-    gone: int  # records in files that somebody has removed or replaced since
     failures: int  # failed writes
     reason: str  # what is wrong now, or was last (a failed write, a rest); "" while nothing was
     refusal: str  # of the newest refused record
@@ -181,8 +180,6 @@ class WriteQueue:
             self._free_space.check()
             self._pause()
         try:
-            if due:
-                self._files.check_files()
             if self._files.unwritten and self._open_next_file():
                 self._files.write_unwritten()
             if self._files.is_open and self._dropped and not self._noted[0]:
@@ -215,8 +212,6 @@ class WriteQueue:
             self.drain(len(self.queue), len(self.views_due) + len(self.queue))
             if self._files.is_open:
                 self._finish_file(NoteKind.END, "end")
-        with suppress(OSError):  # None is open
-            self._files.check_files()
         self.finished = True
 
     def status(self) -> RecorderStatus:
@@ -224,15 +219,14 @@ class WriteQueue:
         files = self._files
         parts = files.parts()
         waiting = len(self.queue) + files.open_messages
-        lost = self._dropped + self._refused + files.gone_records + (waiting if self.closed else 0)
+        lost = self._dropped + self._refused + (waiting if self.closed else 0)
         stuck = bool(files.reason) and not self.closed and not files.has_chunk
         hangs = self.closed and not self.finished
         unwritten_s = max(0.0, self._clock() - self._written_s) if waiting or hangs else 0.0
         is_late = hangs or unwritten_s > LATE_S
         reasons = (
-            (bool(files.gone), f"{', '.join(files.gone)} deleted, moved or replaced"),
             (is_late, f"the recording was last written {unwritten_s:.1f} s ago"),
-            (bool(files.reason) and not (files.gone and not stuck), files.reason),
+            (bool(files.reason), files.reason),
         )
         return RecorderStatus(
             ok=not lost and not stuck and not is_late,
@@ -240,7 +234,6 @@ class WriteQueue:
             waiting=waiting,
             dropped=self._dropped,
             refused=self._refused,
-            gone=files.gone_records,
             failures=files.failures,
             reason="; ".join(text for holds, text in reasons if holds),
             refusal=self._refusal,
