@@ -2,7 +2,7 @@
 
 A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing, records
 wait in the queue, as long as there is room in it. Before the disk is full the file is closed in order, and recording
-rests. Views take most of the time and are not needed to decide alike, so they may come later than their records.
+rests.
 """
 
 from __future__ import annotations
@@ -121,7 +121,6 @@ class WriteQueue:
 
     Attributes:
         queue: topic, log time [ns] and record of what waits; who appends keeps to `log.queue`.
-        views_due: records, with their messages, whose messages for viewers are not made yet.
         closed: no more records will come.
         finished: all that could be done is done.
 
@@ -160,7 +159,6 @@ class WriteQueue:
         self._refused = 0
         self._refusal = ""
         self.queue: deque[tuple[str, int, Record]] = deque()
-        self.views_due: deque[tuple[str, int, Record, bytes]] = deque()
         self.closed = self.finished = False
 
     def drop(self) -> None:
@@ -168,12 +166,8 @@ class WriteQueue:
         with self._drop_lock:
             self._dropped += 1
 
-    def drain(self, records: int, views: int) -> None:
-        """Write up to `records` waiting records, and once a second wait until the disk has them.
-
-        Args:
-            views: records whose messages for viewers are made then, these or earlier ones.
-        """
+    def drain(self, records: int) -> None:
+        """Write up to `records` waiting records and what is derived from them; once a second wait for the disk."""
         due = self._clock() >= self._next_look_s
         if due:
             self._next_look_s = self._clock() + LOOK_S
@@ -189,10 +183,6 @@ class WriteQueue:
                 if not (files.has_room or self._open_next_file()):
                     return
                 self._write_message(*self.queue.popleft())
-            for _ in range(min(views, len(self.views_due))):
-                if not (files.has_room or self._open_next_file()):
-                    return
-                self._write_derived(*self.views_due.popleft())
             if due and self._files.is_open:
                 self._note_changes()
                 self._files.sync()
@@ -209,7 +199,7 @@ class WriteQueue:
         self.closed = True
         for _ in range(LAST_TRIES):
             self._files.allow_retry()
-            self.drain(len(self.queue), len(self.views_due) + len(self.queue))
+            self.drain(len(self.queue))
             if self._files.is_open:
                 self._finish_file(NoteKind.END, "end")
         self.finished = True
@@ -249,7 +239,7 @@ class WriteQueue:
         files = self._files
         if files.has_room:
             return True
-        waits = bool(self.queue or self.views_due or files.unwritten)
+        waits = bool(self.queue or files.unwritten)
         if waits and files.is_open:
             files.because = f"goes on after {files.name}"
             self._finish_file(NoteKind.CONTINUED, "goes on in the next file")
@@ -281,8 +271,8 @@ class WriteQueue:
             self._refused += 1
             self._refusal = str(error)
             return
-        self.views_due.append((topic, at_ns, record, data))
-        self._files.write_record(topic, at_ns, data)
+        derived = self._derived_topics.derive_messages(topic, at_ns, record, data)
+        self._files.write_record(topic, at_ns, data, derived)
         if topic == HEADER:
             self._write_note("begin", NoteKind.BEGIN)
             self._files.commit()
@@ -293,13 +283,6 @@ class WriteQueue:
             )
         else:
             self._parameters.take(record)
-
-    def _write_derived(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
-        """Write the messages for viewers that are derived from a record."""
-        messages = self._derived_topics.derive_messages(topic, at_ns, record, data)
-        if messages:
-            self._files.unwritten.extend(messages)
-            self._files.write_unwritten()
 
     def _note_changes(self) -> None:
         if (self._dropped, self._refused) != self._noted:
@@ -313,7 +296,8 @@ class WriteQueue:
     def _publish_note(self, text: str) -> None:
         """Write a note, which watchers see too."""
         note = self._write_note(text)
-        self._write_derived(RECORDER, note.at_ns, note, encode(note))
+        self._files.unwritten.extend(self._derived_topics.derive_messages(RECORDER, note.at_ns, note, encode(note)))
+        self._files.write_unwritten()
 
     def _write_note(self, text: str, kind: NoteKind = NoteKind.STATE) -> RecorderNote:
         self._noted = (self._dropped, self._refused)
@@ -343,14 +327,9 @@ class WriteQueue:
 
 
 POLL_S = 0.02
-# What a round may take, so that the interpreter, which a tick waits for, is free again after 3 ms at most. Records come
-# first, at 8 us each: unless more than RECORDS waited, the queue then holds nothing that was there when the round
-# began, and a kill loses little of what a busy computer has left behind. Their messages for viewers, three times as
-# dear, can wait. A round every POLL_S makes 1600 records a second with views, several times what a flight has. Of a
-# larger backlog, which a slow disk has left, a share.
-RECORDS = 256
-VIEWS = 32
-BACKLOG_SHARE = 8
+# Records of a round. Each takes some 30 us with its messages for viewers, so that the interpreter, which a tick waits
+# for, is free again after 2 ms. A round every POLL_S makes 3200 records a second, several times what a flight has.
+RECORDS = 64
 
 
 class _Base:
@@ -396,7 +375,7 @@ class SyncRecorder(_Base):
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """Record one value under a topic; whatever goes wrong is in `status()`."""
         super().put(topic, at_ns, record)
-        self._journal.drain(self._log.queue, self._log.queue)
+        self._journal.drain(self._log.queue)
 
     def close(self) -> RecorderStatus:
         """Write the rest, the index and the footer; later records are dropped."""
@@ -454,12 +433,5 @@ class Recorder(_Base):
             self._due.wait(POLL_S)
             self._due.clear()
             with suppress(Exception):  # no memory, say: the next round tries again
-                journal.drain(
-                    compute_batch_size(len(journal.queue), RECORDS), compute_batch_size(len(journal.views_due), VIEWS)
-                )
+                journal.drain(RECORDS)
         journal.finish()
-
-
-def compute_batch_size(waiting: int, at_once: int) -> int:
-    """Return how many of `waiting` records are taken in a round: `at_once`, or a share of a large backlog."""
-    return max(at_once, waiting // BACKLOG_SHARE)
