@@ -6,7 +6,6 @@ import os
 import re
 import resource
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -82,35 +81,6 @@ def get_free_bytes(folder: Path) -> int | None:
         return shutil.disk_usage(folder).free
     except OSError:
         return None
-
-
-class FreeSpaceMonitor:
-    """Watch of the free space: tells when it gets low, when recording must pause, and when it may go on.
-
-    Attributes:
-        low: whether less than `low_bytes` are free.
-        resting: whether less than `stop_bytes` were free, and `low_bytes` have not been since.
-        text: the free space and what follows from it, in words.
-
-    Args:
-        free: gives a folder's free space [bytes]; None, which changes nothing, if that cannot be told.
-    """
-
-    def __init__(self, folder: Path, free: Callable[[Path], int | None], low_bytes: int, stop_bytes: int) -> None:
-        self._folder, self._free, self._low_bytes, self._stop_bytes = folder, free, low_bytes, stop_bytes
-        self.low = self.is_paused = False
-        self.text = ""
-
-    def check(self) -> None:
-        """Look at the free space."""
-        free = self._free(self._folder)
-        if free is None:
-            return
-        self.low = free < self._low_bytes
-        self.is_paused = free < self._stop_bytes or (self.is_paused and self.low)
-        self.text = f"{free} bytes free in {self._folder}" + (
-            f"; recording rests until there are {self._low_bytes}" if self.is_paused else ""
-        )
 
 
 def check_free_space(path: Path, free_bytes: int) -> int:

@@ -1,8 +1,7 @@
 """Recorder: a bounded queue of records, the messages for viewers made beside them, and notes on what was lost.
 
 A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing, records
-wait in the queue, as long as there is room in it. Before the disk is full the file is closed in order, and recording
-rests.
+wait in the queue, as long as there is room in it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Protocol
 import msgspec
 
 from logs.recording import attachments
-from logs.recording.disk import DiskFile, FreeSpaceMonitor, OutputFile, find_later_segments, get_free_bytes
+from logs.recording.disk import DiskFile, OutputFile, find_later_segments, get_free_bytes
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader
 from logs.recording.segment import Rotation
@@ -98,7 +97,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     dropped: int  # records that found the queue full, or came after the end
     refused: int  # records that could not be encoded
     failures: int  # failed writes
-    reason: str  # what is wrong now, or was last (a failed write, a rest); "" while nothing was
+    reason: str  # what is wrong now, or was last (a failed write); "" while nothing was
     refusal: str  # of the newest refused record
     bytes: int  # on the disk
     segments: tuple[str, ...]  # files with at least one chunk
@@ -144,8 +143,9 @@ class WriteQueue:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{path.parent}: {error.strerror}; choose another folder") from error
-        self._free_space = FreeSpaceMonitor(path.parent, free, log.low_bytes, log.stop_bytes)
-        self._free_space.check()
+        self._folder, self._free, self._low_bytes = path.parent, free, log.low_bytes
+        self._is_low, self._free_text = False, ""
+        self._check_free_space()
         self._files = Rotation(path, log, open_file, clock)
         self._parameters = ParameterReader()
         self._clock = clock
@@ -171,8 +171,7 @@ class WriteQueue:
         due = self._clock() >= self._next_look_s
         if due:
             self._next_look_s = self._clock() + LOOK_S
-            self._free_space.check()
-            self._pause()
+            self._check_free_space()
         try:
             if self._files.unwritten and self._open_next_file():
                 self._files.write_unwritten()
@@ -229,10 +228,16 @@ class WriteQueue:
             refusal=self._refusal,
             bytes=sum(size for _, _, size in parts),
             segments=tuple(str(path) for path, _, _ in parts),
-            warning=self._free_space.text if self._free_space.low else "",
+            warning=self._free_text if self._is_low else "",
             unwritten_s=unwritten_s,
             unseen=self._derived_topics.unseen,
         )
+
+    def _check_free_space(self) -> None:
+        """Look at the free space; nothing changes if the system cannot tell it."""
+        free = self._free(self._folder)
+        if free is not None:
+            self._is_low, self._free_text = free < self._low_bytes, f"{free} bytes free in {self._folder}"
 
     def _open_next_file(self) -> bool:
         """Return whether there is a file to write to; one is begun if something waits for it."""
@@ -245,22 +250,13 @@ class WriteQueue:
             self._finish_file(NoteKind.CONTINUED, "goes on in the next file")
         if files.is_open:
             return True
-        if not waits or not files.may_begin or (self._free_space.is_paused and not self.closed):
+        if not waits or not files.may_begin:
             return False
         head = self.queue[0][2] if self.queue else None
         if isinstance(head, Header):  # it comes first, and tells the time of all that follows
             files.zero_utc_ns = head.zero_utc_ns or 0
         files.begin(self._write_note)
         return True
-
-    def _pause(self) -> None:
-        """Close the file in order while the disk still has room for that."""
-        if not self._free_space.is_paused or self.closed:
-            return
-        self._files.reason = self._free_space.text
-        if self._files.is_open:
-            self._files.because = f"after a rest: {self._free_space.text}"
-            self._finish_file(NoteKind.STATE, self._free_space.text)
 
     def _write_message(self, topic: str, at_ns: int, record: Record) -> None:
         if isinstance(record, Datagram):
@@ -287,11 +283,9 @@ class WriteQueue:
     def _note_changes(self) -> None:
         if (self._dropped, self._refused) != self._noted:
             self._publish_note("records lost" + (f"; newest refusal: {self._refusal}" if self._refusal else ""))
-        if self._free_space.low != self._is_low_noted:
-            self._is_low_noted = self._free_space.low
-            self._publish_note(
-                f"disk {'gets low' if self._is_low_noted else 'has room again'}: {self._free_space.text}"
-            )
+        if self._is_low != self._is_low_noted:
+            self._is_low_noted = self._is_low
+            self._publish_note(f"disk {'gets low' if self._is_low else 'has room again'}: {self._free_text}")
 
     def _publish_note(self, text: str) -> None:
         """Write a note, which watchers see too."""

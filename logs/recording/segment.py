@@ -379,7 +379,7 @@ class Rotation:
         written: messages so far, repeated ones included.
         at_ns: log time of the newest record.
         failures: failed writes.
-        reason: reason of the newest failed write, or why recording pauses.
+        reason: reason of the newest failed write.
         zero_utc_ns: UTC of time 0 of our clock [ns since 1970], for the files that are begun from now on.
     """
 

@@ -6,7 +6,6 @@ from them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -21,17 +20,7 @@ from uavctl.config.connections import (
     SecurityConfig,
     SourceConfig,
 )
-from uavctl.config.document import (
-    MAX_DURATION_S,
-    MAX_STATES,
-    ConfigProblem,
-    Floats,
-    Position,
-    Rows,
-    Section,
-    UnboundedFloats,
-    Weights,
-)
+from uavctl.config.document import MAX_DURATION_S, MAX_STATES, Floats, Position, Rows, Section, UnboundedFloats, Weights
 from uavctl.config.link import LinkConfig
 from uavctl.config.mission import FenceConfig, MissionConfig
 from uavctl.config.sim import SimConfig
@@ -56,24 +45,6 @@ class LogConfig(Section, frozen=True, kw_only=True):
     low_bytes: Annotated[
         int, Meta(ge=0, le=10**15, description="less free space than this in flight is a warning [bytes]")
     ] = 30_000_000
-    stop_bytes: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=10**15,
-            description="recording rests with less free space than this, until there is low_bytes [bytes]",
-        ),
-    ] = 10_000_000
-
-
-def check_log(log: LogConfig) -> Iterator[ConfigProblem]:
-    """Yield the keys that do not fit together."""
-    if log.stop_bytes > log.low_bytes:
-        yield ConfigProblem(
-            "log.stop_bytes",
-            f"{log.stop_bytes} is more than log.low_bytes = {log.low_bytes}: there would be no warning",
-            "lower it",
-        )
 
 
 MAX_PLANNED_HORIZON = 40  # solving the program with planned feedback takes seconds beyond
