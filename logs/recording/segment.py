@@ -29,6 +29,8 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
+    Chunk,
+    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -50,16 +52,8 @@ MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log tim
 _MESSAGE_FIELDS = 22  # bytes of a message record besides its data
 _OPCODE = int(Opcode.MESSAGE)
 INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
-# Opcode, length, first time, last time, size, CRC-32, length of the compression's name; then name and stored size.
-CHUNK = struct.Struct("<BQQQQII")
-STORED_SIZE = struct.Struct("<Q")
-CHUNK_FIELDS = 40  # least length: that of an empty chunk without compression
 COMPRESSION = b"zstd"
 _LEVEL = 1  # 3 makes a flight's recording 1 % smaller for twice the time
-_CHUNK_INDEX = struct.Struct("<BQQQQQI")  # opcode, length, first and last time, start, length, bytes of offsets
-_OFFSET = struct.Struct("<HQ")  # channel, where its index is
-_CHUNK_INDEX_END = struct.Struct(f"<QI{len(COMPRESSION)}sQQ")  # bytes of the indexes, compression, sizes
-_CHUNK_INDEX_FIELDS = 64 + len(COMPRESSION)
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
 # Metadata of each channel: UTC of time 0 of our clock [ns since 1970], that log times are later than the records' own.
 # In each chunk, as all of a channel is, and so there whatever else of the file is damaged.
@@ -250,33 +244,43 @@ class Segment:
         times_ns = [entry.at_ns + self._zero_utc_ns for entry in entries]
         first, last = min(times_ns), max(times_ns)
         size, stored = len(content), self._compress(content)
-        fields = CHUNK_FIELDS + len(COMPRESSION) + len(stored)
-        head = CHUNK.pack(Opcode.CHUNK, fields, first, last, size, zlib.crc32(content), len(COMPRESSION))
-        head += COMPRESSION + STORED_SIZE.pack(len(stored))
-        length = len(head) + len(stored)
+        chunk = _pack_records(
+            Chunk(
+                compression=COMPRESSION.decode(),
+                data=stored,
+                message_start_time=first,
+                message_end_time=last,
+                uncompressed_crc=zlib.crc32(content),
+                uncompressed_size=size,
+            )
+        )
         prefix = self._make_prefix()
         start = self.bytes + len(prefix)
-        at, offsets = start + length, []
-        indexes = []
+        at = start + len(chunk)
+        offsets, indexes = {}, []
         for channel_id, flat in self._indexes.items():
-            offsets.append(_OFFSET.pack(channel_id, at))
+            offsets[channel_id] = at
             indexes.append(
                 INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
                 + struct.pack(f"<{len(flat)}Q", *flat)
             )
             at += len(indexes[-1])
-        block = b"".join([prefix, head, stored, *indexes])
+        block = b"".join([prefix, chunk, *indexes])
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
         self.bytes += len(block)
-        offset_bytes = b"".join(offsets)
-        fields = _CHUNK_INDEX_FIELDS + len(offset_bytes)
-        self._chunk_indexes += _CHUNK_INDEX.pack(
-            Opcode.CHUNK_INDEX, fields, first, last, start, length, len(offset_bytes)
-        )
-        self._chunk_indexes += offset_bytes
-        self._chunk_indexes += _CHUNK_INDEX_END.pack(
-            at - start - length, len(COMPRESSION), COMPRESSION, len(stored), size
+        self._chunk_indexes += _pack_records(
+            ChunkIndex(
+                chunk_start_offset=start,
+                chunk_length=len(chunk),
+                compression=COMPRESSION.decode(),
+                compressed_size=len(stored),
+                uncompressed_size=size,
+                message_start_time=first,
+                message_end_time=last,
+                message_index_length=at - start - len(chunk),
+                message_index_offsets=offsets,
+            )
         )
         self._chunks += 1
         earlier_times_ns = self._times_ns or (first, last)
