@@ -130,7 +130,7 @@ def test_what_the_paper_s_scheme_needs_is_passed_over_where_it_is_given_to_the_o
         ("horizon = 12", "horizon = 1", "smpc.horizon", "expected a whole number >= 2, got 1"),
         ("horizon = 12", "horizon = 41", "smpc.horizon", "41 steps are more than planned feedback is solved for, 40"),
         ("horizon = 12", "horizon = 101", "smpc.horizon", "expected a whole number <= 100, got 101"),
-        ("tau = 4", "", "smpc.tau", "missing key; add it: whole number (>= 1, <= 20), delay τ of the terminal control"),
+        ("tau = 4", "", "smpc.tau", "missing key; add it: whole number (>= 1, <= 20), delay τ"),
         ("tau = 4", 'tau = "4"', "smpc.tau", 'expected a whole number, got "4"'),
         ("delta_u = 0.9", "", "smpc.delta_u", "missing key; add it: number (> 0, < 1), likelihood δ_u"),
         ("delta_tau = 0.99", "", "smpc.delta_tau", "missing key"),

@@ -302,6 +302,23 @@ Wind = tuple[Speed, Speed, Speed]
 Spans = tuple[tuple[Number, Number], ...]
 
 
+def declare(
+    meaning: str,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    above: float | None = None,
+    below: float | None = None,
+    length: int | tuple[int, int] | None = None,
+) -> Meta:
+    """Declare a key of a section: its meaning, unit and range; of a list or text the largest length, or both bounds."""
+    shortest, longest = length if isinstance(length, tuple) else (None, length)
+    bounds = {"ge": low, "le": high, "gt": above, "lt": below, "min_length": shortest, "max_length": longest}
+    given: dict[str, Any] = {name: bound for name, bound in bounds.items() if bound is not None}
+    return Meta(description=f"{meaning} [{unit}]" if unit else meaning, **given)
+
+
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of all sections."""
 

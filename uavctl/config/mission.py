@@ -23,6 +23,7 @@ from uavctl.config.document import (
     Number,
     Position,
     Section,
+    declare,
     read_row_lines,
     refuse_file,
 )
@@ -32,74 +33,46 @@ class TrajectoryConfig(Section, frozen=True, kw_only=True):
     """A trajectory as samples; time counts from the first decision with a vehicle that takes setpoints."""
 
     times_s: Annotated[
-        Floats,
-        Meta(max_length=MAX_TRAJECTORY_SAMPLES, description="times of the samples, increasing from 0 or later [s]"),
+        Floats, declare("times of the samples, increasing from 0", "s", length=MAX_TRAJECTORY_SAMPLES)
     ] = ()
     positions_m: Annotated[
-        tuple[Position, ...],
-        Meta(max_length=MAX_TRAJECTORY_SAMPLES, description="positions at these times, local NED [m]"),
+        tuple[Position, ...], declare("positions at these times, local NED", "m", length=MAX_TRAJECTORY_SAMPLES)
     ] = ()
     velocities_mps: Annotated[
         tuple[Position, ...],
-        Meta(
-            max_length=MAX_TRAJECTORY_SAMPLES,
-            description="velocities at these times, local NED [m/s]; without them they follow from the positions",
+        declare(
+            "velocities at these times, local NED; default: by the positions", "m/s", length=MAX_TRAJECTORY_SAMPLES
         ),
     ] = ()
     file: Annotated[
         str,
-        Meta(
-            max_length=MAX_PATH_LENGTH,
-            description="CSV file with the samples instead, beside this file: columns t, x, y, z in s and m, and "
-            "vx, vy, vz in m/s or none of them, in local NED; with a header line in the order that it states, by names "
-            "and units as in `time_ms`, `east_m`, `height [cm]`, `v_north_mps`",
+        declare(
+            "CSV file with the samples, beside this one: t, x, y, z and perhaps vx, vy, vz in s, m and m/s, "
+            "local NED; a header may state others, as in `time_ms`, `east_m`, `height [cm]`",
+            length=MAX_PATH_LENGTH,
         ),
     ] = ""
-    interpolation: Annotated[
-        Literal["cubic", "linear"], Meta(description="between the samples: `cubic` spline, or `linear`")
-    ] = "cubic"
+    interpolation: Annotated[Literal["cubic", "linear"], declare("`cubic` spline, or `linear`")] = "cubic"
 
 
 class MissionConfig(Section, frozen=True, kw_only=True):
     """Waypoints, or a trajectory; with neither, `target.position_m` is held from start to end."""
 
-    waypoints: Annotated[
-        tuple[Position, ...],
-        Meta(max_length=1000, description="positions to fly to, one after the other, local NED [m]"),
-    ] = ()
+    waypoints: Annotated[tuple[Position, ...], declare("positions to fly to, local NED", "m", length=1000)] = ()
     hold_s: Annotated[
-        Number | Annotated[Floats, Meta(max_length=1000)],
-        Meta(description="time at each waypoint, from the arrival on: one number, or one for each of them [s]"),
+        Number | Annotated[Floats, Meta(max_length=1000)], declare("time at each waypoint: one number, or a list", "s")
     ] = 0.0
-    accept_m: Annotated[
-        float, Meta(ge=0.001, le=1e6, description="a waypoint is reached when the estimate is this near to it [m]")
-    ] = 0.3
+    accept_m: Annotated[float, declare("distance at which a waypoint is reached", "m", 0.001, 1e6)] = 0.3
     then: Annotated[
         Literal["hold", "land"],
-        Meta(
-            description="after the last waypoint's time, or the trajectory's end: `hold` that place, or `land`: brake "
-            "and hand over to the vehicle's own landing"
-        ),
+        declare("at the end: `hold` the place, or `land`: brake and hand over to the vehicle's own landing"),
     ] = "hold"
     yaw: Annotated[
         Literal["hold", "path", "angle"],
-        Meta(
-            description="yaw setpoint: `hold` sends none (PX4 keeps its yaw, ArduPilot does as WP_YAW_BEHAVIOR says), "
-            "`path` follows the planned motion from 0.3 m/s on, `angle` turns to `yaw_deg`"
-        ),
+        declare("`hold`: no yaw setpoint; `path`: along the planned motion from 0.3 m/s on; `angle`: `yaw_deg`"),
     ] = "hold"
-    yaw_deg: Annotated[
-        Annotated[float, Meta(ge=-180, le=180)] | None,
-        Meta(description="yaw of `angle`, clockwise from north as seen from above [deg]"),
-    ] = None
-    yaw_rate_dps: Annotated[
-        float,
-        Meta(
-            ge=1,
-            le=360,
-            description="largest turn of the yaw setpoint in a second; ArduPilot's own limit is 60 [deg/s]",
-        ),
-    ] = 60.0
+    yaw_deg: Annotated[Annotated[float, Meta(ge=-180, le=180)] | None, declare("clockwise from north", "deg")] = None
+    yaw_rate_dps: Annotated[float, declare("fastest turn of yaw; ArduPilot's own limit is 60", "deg/s", 1, 360)] = 60.0
     trajectory: TrajectoryConfig = TrajectoryConfig()
 
 
@@ -108,21 +81,11 @@ class FenceConfig(Section, frozen=True, kw_only=True):
 
     state: Annotated[
         Annotated[str, Meta(max_length=100)] | Annotated[int, Meta(ge=0, lt=MAX_STATES)],
-        Meta(description="axis whose position is limited (`north`, `east`, `down`), or index of a state"),
+        declare("axis whose position is limited, or index of a state"),
     ]
-    side: Annotated[Literal["lower", "upper"], Meta(description="which limit")]
-    times_s: Annotated[
-        Floats,
-        Meta(min_length=1, max_length=1000, description="times, increasing; counted as those of the mission [s]"),
-    ]
-    values: Annotated[
-        Floats,
-        Meta(
-            min_length=1,
-            max_length=1000,
-            description="limit at these times, a line in between, constant before and after [m, m/s, m/s²]",
-        ),
-    ]
+    side: Annotated[Literal["lower", "upper"], declare("which limit")]
+    times_s: Annotated[Floats, declare("times, increasing; counted as those of the mission", "s", length=(1, 1000))]
+    values: Annotated[Floats, declare("limits at these times, linear in between", "m, m/s, m/s²", length=(1, 1000))]
 
 
 _FORMAT_HINT = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
