@@ -44,10 +44,10 @@ north_m = [-2.0, 2.0]
 * `base` gives all keys that the file lacks. `[room]` then gives the limits by name instead of the lists of `[sets]`
   and `[target]`. `uavctl init` writes such a file.
 * Without `base` a file needs `[plant]`, `[sets]` and `[cost]`. Other keys have a default, or follow from these.
-* All problems are reported at once, each with file, line, key and remedy (exit code 2). Every number has a range
+* All problems are reported at once, each with file, line, key and remedy (exit code 2). Each number has a range
   (1e7 at most if none is given), and every text and list a longest length.
-* States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model `velocity-reference`
-  has besides: acceleration, lead of the vehicle's own reference in position and velocity, integral.
+* States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model
+  `velocity-reference` has besides: acceleration, lead of the vehicle's own reference in position and velocity, integral.
 * n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
 * A plant of `matrices` without `axes` has no place in a room. `solve`, `design`, `campaign` and `uavctl.simulate`
   take it.
