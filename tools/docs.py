@@ -47,7 +47,7 @@ north_m = [-2.0, 2.0]
 * All problems are reported at once, each with file, line, key and remedy (exit code 2). Each number has a range
   (1e7 at most if none is given), and every text and list a longest length.
 * States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model
-  `velocity-reference` has besides: acceleration, lead of the vehicle's own reference in position and velocity, integral.
+  `velocity-reference` has besides: acceleration, lead of the vehicle's reference in position and velocity, integral.
 * n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
 * A plant of `matrices` without `axes` has no place in a room. `solve`, `design`, `campaign` and `uavctl.simulate`
   take it.

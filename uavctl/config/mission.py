@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
-from uavctl.config.columns import TRAJECTORY_UNITS, StatedColumn, parse_heading, read_header
 from uavctl.config.document import (
     MAX_NUMBER,
     MAX_PATH_LENGTH,
@@ -132,6 +131,59 @@ def read_trajectory_file(
     return msgspec.structs.replace(mission, trajectory=samples), places
 
 
+# Quantity and sign of the words in a header, and the factors of units.
+_QUANTITIES = {
+    **dict.fromkeys(("t", "time", "stamp", "timestamp"), ("t", 1.0)),
+    **dict.fromkeys(("x", "north", "n"), ("x", 1.0)),
+    **dict.fromkeys(("y", "east", "e"), ("y", 1.0)),
+    **dict.fromkeys(("z", "down", "d"), ("z", 1.0)),
+    **dict.fromkeys(("height", "up", "altitude", "alt", "h"), ("z", -1.0)),
+}
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+_METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "km": 1000.0}
+_SPEEDS = {unit + form: factor for unit, factor in _METRES.items() for form in ("ps", "/s")} | {"km/h": 1.0 / 3.6}
+_UNITS = {"t": _SECONDS, **dict.fromkeys(("x", "y", "z"), _METRES), **dict.fromkeys(("vx", "vy", "vz"), _SPEEDS)}
+# A word for position or velocity, a quantity, and a unit after `_` or in brackets: `pos_x`, `v_north [cm/s]`.
+_HEADING = re.compile(
+    rf"(?:p|pos|position|(?P<velocity>v|vel|velocity|speed))?[_\s.\-]*+(?P<quantity>{'|'.join(_QUANTITIES)})"
+    r"(?:(?:[_\s]++|(?=[\[(]))[\[(]?(?P<unit>[^\])]*)[\])]?)?"
+)
+
+
+class StatedColumn(NamedTuple):
+    """Place of a quantity in the rows, and what a number there is multiplied by."""
+
+    column: int
+    factor: float
+
+
+def parse_heading(cell: str) -> tuple[str, float, str] | None:
+    """What a heading names: `t`, `x`, `vx` …, its sign, and its unit (empty where it states none); None if nothing."""
+    match = _HEADING.fullmatch(cell.strip(" \"'").lower())
+    if match is None:
+        return None
+    name, sign = _QUANTITIES[match["quantity"]]
+    return ("v" if match["velocity"] else "") + name, sign, (match["unit"] or "").strip()
+
+
+def read_header(cells: Sequence[str]) -> tuple[dict[str, StatedColumn], list[str]]:
+    """The columns of a header by quantity, and what is wrong with it."""
+    columns: dict[str, StatedColumn] = {}
+    problems: list[str] = []
+    for index, cell in enumerate(cells):
+        label = f'column {index + 1}, "{cell.strip()[:_MAX_SHOWN]}"'
+        name, sign, unit = parse_heading(cell) or ("", 1.0, "")
+        if name not in _UNITS:
+            problems.append(f"{label}, is not a quantity that is known here; rename or remove the column")
+        elif unit and unit not in _UNITS[name]:
+            problems.append(f'{label}: "{unit}" is not a unit of it; give one of {", ".join(_UNITS[name])}')
+        elif name in columns:
+            problems.append(f"{label}, means the same as column {columns[name].column + 1}; keep one of them")
+        else:
+            columns[name] = StatedColumn(index, sign * (_UNITS[name][unit] if unit else 1.0))
+    return columns, problems
+
+
 # A cell of a header, without separators outside of brackets. A bracket without its end goes on to the end of the line:
 # a pattern that fails there would begin again at every later bracket, and take quadratic time.
 _HEADER_CELL = re.compile(r"(?:[^,\s\[(]|[\[(][^\])]*[\])]?)+")
@@ -184,11 +236,8 @@ def _read_columns(
     if not rows or any(_parse_number(cell) is not None for cell in rows[0][1]):
         return [], rows
     (line, cells), rows = rows[0], rows[1:]
-    units = None
-    if rows and not any(_parse_number(cell) is not None for cell in rows[0][1]):
-        units, rows = rows[0][1], rows[1:]
-    columns, problems = read_header(cells, units, TRAJECTORY_UNITS)
-    names = list(TRAJECTORY_UNITS)
+    columns, problems = read_header(cells)
+    names = list(_UNITS)
     required = names if any(name in columns for name in names[_POSITION_COLUMNS:]) else names[:_POSITION_COLUMNS]
     if not problems and (missing := [name for name in required if name not in columns]):
         problems.append(f"the header has no column for {', '.join(missing)}; {_FORMAT_HINT}")
