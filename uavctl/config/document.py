@@ -311,11 +311,14 @@ def declare(
     above: float | None = None,
     below: float | None = None,
     length: int | tuple[int, int] | None = None,
+    pattern: str | None = None,
 ) -> Meta:
     """Declare a key of a section: its meaning, unit and range; of a list or text the largest length, or both bounds."""
     shortest, longest = length if isinstance(length, tuple) else (None, length)
     bounds = {"ge": low, "le": high, "gt": above, "lt": below, "min_length": shortest, "max_length": longest}
     given: dict[str, Any] = {name: bound for name, bound in bounds.items() if bound is not None}
+    if pattern is not None:
+        given["pattern"] = pattern
     return Meta(description=f"{meaning} [{unit}]" if unit else meaning, **given)
 
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 import numpy as np
-from msgspec import NODEFAULT, Meta
+from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo
 
 from uavctl.config.checks import check_sections
@@ -30,6 +30,7 @@ from uavctl.config.document import (
     DataFileError,
     Section,
     Source,
+    declare,
     describe_type,
     find_excess,
     find_key_lines,
@@ -607,9 +608,7 @@ def read_document(section: type[D], path: Path) -> tuple[D | None, Source, list[
 
 
 FaultCheck = Callable[[Literal["px4", "ardupilot"], Sequence[FaultConfig], str], Iterable[ConfigProblem]]
-_Faults = Annotated[
-    tuple[FaultConfig, ...], Meta(max_length=MAX_FAULTS, description="what happens in the course of a flight")
-]
+_Faults = Annotated[tuple[FaultConfig, ...], declare("what happens in the course of a flight", length=MAX_FAULTS)]
 
 
 class _FaultFile(Section, frozen=True, kw_only=True):

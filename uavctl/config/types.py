@@ -1,7 +1,6 @@
 """Typed configuration: one definition gives the decoder, the checks and the reference page.
 
-Every key has its unit and meaning in `Meta(description=...)`; `docs/configuration.md` is generated
-from them.
+Each key is declared with its type, meaning, unit, range and default; `docs/configuration.md` is generated from them.
 """
 
 from __future__ import annotations
