@@ -28,25 +28,29 @@ _CONFIGURATION = """# Configuration
 
 This page is generated from the types in `uavctl/config/` (`make docs`); do not edit it.
 
-A configuration is a TOML file. `--config NAME` takes a preset (`paper`, `room`, `room-px4`, `room-ardupilot`,
-`room-hahn-stursberg`: complete examples in `uavctl/presets/`) or a file; `--set key.path=value` (repeatable) overrides
-any key, with a value as TOML writes it, for example `--set link.loss=0.3`, `--set 'link.blackout=[[20, 40]]'`; a string
-needs no quotes.
-Unknown keys, missing keys, wrong types and shapes, and inconsistent limits are refused before anything starts,
-all at once, each with file, line and key (exit code 2). So is what is beyond all bounds: every number has a range,
-and every list and text a longest length, whether it is told below or not (1e7 at most, 1000 characters).
+A configuration is a TOML file. The shortest one names a preset and overrides some keys:
 
-States are ordered axis by axis: position, velocity (and acceleration with model `drag-lag`; acceleration,
-lead of the vehicle's own reference in position and in velocity, and integral with model `velocity-reference`).
-n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
+```toml
+base = "room-px4"
 
-A file needs `[plant]`, `[sets]` and `[cost]`; what it leaves out has a default, or follows from these: the target is
-the origin (the middle where that is outside), the setpoint limiter is as wide as the inputs' limits, a camera sends a
-position each Δt. The name is that of the file. A plant of model `matrices` without `axes` is one of states that mean
-nothing in a room: `solve`, `design`, `campaign` and `uavctl.simulate` take it, flights do not.
+[room]
+north_m = [-2.0, 2.0]
+```
 
-`base = "room-px4"` (any preset) at the top of a file gives all keys that the file has not. With it `[room]` gives the
-limits by name, in place of the lists of `[sets]` and `[target]`; `uavctl init` writes such a file.
+`--config NAME` takes a file or a preset: `paper`, `room`, `room-px4`, `room-ardupilot` or `room-hahn-stursberg`
+(complete examples in `uavctl/presets/`). `--set key.path=value` overrides any key and may be repeated, as in
+`--set link.loss=0.3` or `--set 'link.blackout=[[20, 40]]'`. A string needs no quotes.
+
+* `base` gives all keys that the file lacks. `[room]` then gives the limits by name instead of the lists of `[sets]`
+  and `[target]`. `uavctl init` writes such a file.
+* Without `base` a file needs `[plant]`, `[sets]` and `[cost]`. Other keys have a default, or follow from these.
+* All problems are reported at once, each with file, line, key and remedy (exit code 2). Each number has a range
+  (1e7 at most if none is given), and every text and list a longest length.
+* States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model
+  `velocity-reference` has besides: acceleration, lead of the vehicle's reference in position and velocity, integral.
+* n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
+* A plant of `matrices` without `axes` has no place in a room. `solve`, `design`, `campaign` and `uavctl.simulate`
+  take it.
 """
 # Keys that follow from others where they are left out.
 _DERIVED = {

@@ -6,7 +6,6 @@ import os
 import re
 import resource
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -41,7 +40,6 @@ class DiskFile:
     """
 
     def __init__(self, path: Path) -> None:
-        # What is appended to a file that somebody has cut stays too short, and so can be seen.
         self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
 
     def write(self, data: bytes) -> None:
@@ -77,56 +75,12 @@ def find_later_segments(path: Path) -> tuple[Path, ...]:
     return tuple(files_by_number[number] for number in sorted(files_by_number))
 
 
-def is_present(path: Path, size: int, opened: os.stat_result | None = None) -> bool:
-    """Return whether a file is still where it was made, and no shorter than what was written to it.
-
-    Args:
-        opened: status of the file while it is open; of a closed file some file systems (FAT) change the number.
-    """
-    try:
-        status = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError:
-        return True  # nobody knows, and the next write will tell
-    return status.st_size >= size and (opened is None or os.path.samestat(status, opened))
-
-
 def get_free_bytes(folder: Path) -> int | None:
     """Return the free space of a folder's file system [bytes]; None if it cannot be told."""
     try:
         return shutil.disk_usage(folder).free
     except OSError:
         return None
-
-
-class FreeSpaceMonitor:
-    """Watch of the free space: tells when it gets low, when recording must pause, and when it may go on.
-
-    Attributes:
-        low: whether less than `low_bytes` are free.
-        resting: whether less than `stop_bytes` were free, and `low_bytes` have not been since.
-        text: the free space and what follows from it, in words.
-
-    Args:
-        free: gives a folder's free space [bytes]; None, which changes nothing, if that cannot be told.
-    """
-
-    def __init__(self, folder: Path, free: Callable[[Path], int | None], low_bytes: int, stop_bytes: int) -> None:
-        self._folder, self._free, self._low_bytes, self._stop_bytes = folder, free, low_bytes, stop_bytes
-        self.low = self.is_paused = False
-        self.text = ""
-
-    def check(self) -> None:
-        """Look at the free space."""
-        free = self._free(self._folder)
-        if free is None:
-            return
-        self.low = free < self._low_bytes
-        self.is_paused = free < self._stop_bytes or (self.is_paused and self.low)
-        self.text = f"{free} bytes free in {self._folder}" + (
-            f"; recording rests until there are {self._low_bytes}" if self.is_paused else ""
-        )
 
 
 def check_free_space(path: Path, free_bytes: int) -> int:

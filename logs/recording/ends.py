@@ -84,4 +84,4 @@ def describe_ending(ending: Ending, status: RecorderStatus) -> Ending:
 
 def count_missing_records(status: RecorderStatus) -> int:
     """Return the number of records that are not in the recording."""
-    return status.dropped + status.refused + status.gone + status.waiting
+    return status.dropped + status.refused + status.waiting

@@ -16,11 +16,12 @@ import csv
 import types
 import typing
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -53,107 +54,63 @@ class TableColumn:
     """One column of a table."""
 
     name: str
-    kind: type  # of its cells, one of `_LEAVES` or `Instant`
+    kind: type  # of its cells: int, float, bool, str, bytes or `Instant`
 
 
-class _Leaf:
-    """A single column; `cell` makes a cell of a value."""
-
-    def __init__(self, kind: type, cell: Callable[[Any], Cell] = lambda value: value) -> None:
-        self._kind, self._cell = kind, cell
-
-    def learn(self, value: Any) -> None:
-        """Do nothing: there is one column whatever the value."""
-
-    def columns(self, name: str) -> Iterator[TableColumn]:
-        yield TableColumn(name, self._kind)
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        row.append(None if value is None else self._cell(value))
-
-
-class _Parts:
-    """Columns of a value's parts, one part after another.
-
-    Args:
-        mark: between the value's name and the part's key.
-        parts: a value's parts by key.
-        forms: forms of the parts that every value has.
-        item: type of the parts that only some values have: as many as the longest list, the keys of any mapping.
-    """
-
-    def __init__(
-        self, mark: str, parts: Callable[[Any], Mapping[Any, Any]], forms: Mapping[Any, _Form], item: Any = None
-    ) -> None:
-        self._mark, self._parts, self._forms, self._item = mark, parts, dict(forms), item
-
-    def learn(self, value: Any) -> None:
-        """Look at a value to find the columns that it needs."""
-        for key, part in ({} if value is None else self._parts(value)).items():
-            if key not in self._forms:
-                self._forms = dict(sorted([*self._forms.items(), (key, _choose_form(self._item))]))
-            self._forms[key].learn(part)
-
-    def columns(self, name: str) -> Iterator[TableColumn]:
-        """Return the columns that all values need, each name beginning with `name`."""
-        for key, form in self._forms.items():
-            yield from form.columns(f"{name}{self._mark}{key}" if name else key)
-
-    def put(self, value: Any, row: list[Cell]) -> None:
-        """Append the cells of a value, one for each column."""
-        parts = {} if value is None else self._parts(value)
-        for key, form in self._forms.items():
-            form.put(parts.get(key), row)
-
-
-# How values of one type stand in columns; told all values first, then asked for the cells of each.
-_Form = _Leaf | _Parts
-
-
-def _list_columns(kind: type[msgspec.Struct]) -> _Parts:
-    forms = {field.name: _choose_form(field.type) for field in msgspec.structs.fields(kind)}
-    return _Parts(".", lambda value: {name: getattr(value, name) for name in forms}, forms)
-
-
+Place = tuple[int | str, ...]  # of a column: numbers of fields and entries, and keys, which sort the columns
+Spread = list[tuple[Place, str, type, Cell]]  # place, name, type and cell of each column
 _LEAVES = (int, float, bool, str, bytes)
 
 
-def _choose_form(kind: Any) -> _Form:
-    """Return the form of a field's type; None makes an empty cell of any type.
+def spread(columns: Spread, value: Any, kind: Any, name: str = "", place: Place = ()) -> None:
+    """Append the columns that a value's type or its length asks for; None makes empty cells.
 
     Raises:
-        TypeError: no table has a place for such values.
+        TypeError: no column can hold such values.
     """
-    kind = _remove_none(kind)
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    kind, origin, arguments = _take_apart(kind)
     if kind in _LEAVES:
-        return _Leaf(kind)
-    if kind == Vec3:
-        axis = _Leaf(float)
-        return _Parts("_", lambda value: dict(zip(_AXES, value, strict=True)), dict.fromkeys(_AXES, axis))
-    if origin is tuple and arguments[-1] is Ellipsis:
-        if _is_record(arguments[0]):  # they stand in a table of their own
-            return _Leaf(int, len)
-        return _Parts("_", lambda value: dict(enumerate(value)), {}, arguments[0])
-    if kind == Array:
-        return _Parts("_", lambda value: dict(enumerate(value.tolist())), {}, Vector)
-    if origin is dict:
-        if arguments[1] is object:
-            return _Leaf(str, lambda value: msgspec.json.encode(value).decode())
-        return _Parts(".", dict, {}, arguments[1])
-    if isinstance(kind, type) and issubclass(kind, StrEnum):
-        return _Leaf(str, lambda value: value.value)
-    if _is_record(kind):
-        return _list_columns(kind)
-    raise TypeError(f"no column can hold {kind}")
+        columns.append((place, name, kind, value))
+    elif kind == Vec3:
+        for index, axis in enumerate(_AXES):
+            columns.append(((*place, index), f"{name}_{axis}", float, None if value is None else value[index]))
+    elif kind == Array:
+        spread(columns, None if value is None else value.tolist(), tuple[Vector, ...], name, place)
+    elif origin is tuple and _is_record(arguments[0]):  # they stand in a table of their own
+        columns.append((place, name, int, None if value is None else len(value)))
+    elif origin is tuple and arguments[0] in _LEAVES:
+        for index, item in enumerate(value or ()):
+            columns.append(((*place, index), f"{name}_{index}", arguments[0], item))
+    elif origin is tuple and arguments[-1] is Ellipsis:
+        for index, item in enumerate(value or ()):
+            spread(columns, item, arguments[0], f"{name}_{index}", (*place, index))
+    elif origin is dict and arguments[1] is object:
+        columns.append((place, name, str, None if value is None else msgspec.json.encode(value).decode()))
+    elif origin is dict:
+        for key, item in (value or {}).items():
+            spread(columns, item, arguments[1], f"{name}.{key}", (*place, key))
+    elif _is_record(kind):
+        for index, field in enumerate(_list_fields(kind)):
+            field_name = f"{name}.{field.name}" if name else field.name
+            part = None if value is None else getattr(value, field.name)
+            spread(columns, part, field.type, field_name, (*place, index))
+    elif isinstance(kind, type) and issubclass(kind, StrEnum):
+        columns.append((place, name, str, None if value is None else value.value))
+    else:
+        raise TypeError(f"no column can hold {kind}")
 
 
-def _remove_none(kind: Any) -> Any:
-    """Return a type without None."""
+@cache
+def _list_fields(kind: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    return msgspec.structs.fields(kind)
+
+
+@cache
+def _take_apart(kind: Any) -> tuple[Any, Any, tuple[Any, ...]]:
+    """Return a type without None, its origin (`tuple` of `tuple[int, ...]`), and the origin's arguments."""
     if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
-        (member_type,) = (member for member in typing.get_args(kind) if member is not types.NoneType)
-        return member_type
-    return kind
+        (kind,) = (member for member in typing.get_args(kind) if member is not types.NoneType)
+    return kind, typing.get_origin(kind), typing.get_args(kind)
 
 
 def _is_record(kind: Any) -> bool:
@@ -164,29 +121,38 @@ class _Table:
     """Columns and rows of one type of record, after columns that the table adds."""
 
     def __init__(self, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> None:
-        self._lead = lead
-        self._form = _list_columns(kind)
+        self._lead, self._kind = lead, kind
+        self._columns: dict[Place, TableColumn] = {}
+        self._places: list[Place] = []
         self.lists = tuple(_find_record_lists(kind))
         self.rows = 0
+        self.learn(None)
 
-    def learn(self, record: msgspec.Struct) -> None:
-        self._form.learn(record)
+    def learn(self, record: msgspec.Struct | None) -> None:
+        """Add the columns that a record needs; None: those that all records of the type have."""
+        columns: Spread = []
+        spread(columns, record, self._kind)
+        for place, name, kind, _ in columns:
+            if place not in self._columns:
+                self._columns[place] = TableColumn(name, kind)
 
     def columns(self) -> tuple[TableColumn, ...]:
+        self._places = sorted(self._columns)
         lead = (TableColumn(name, Instant if name == _UTC else int) for name in self._lead)
-        return (*lead, *self._form.columns(""))
+        return (*lead, *(self._columns[place] for place in self._places))
 
     def row(self, lead: tuple[int, ...], record: msgspec.Struct) -> list[Cell]:
         self.rows += 1
-        row: list[Cell] = [*lead]
-        self._form.put(record, row)
-        return row
+        columns: Spread = []
+        spread(columns, record, self._kind)
+        cells = {place: cell for place, _, _, cell in columns}
+        return [*lead, *map(cells.get, self._places)]
 
 
 def _find_record_lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struct]]]:
     """Return the fields that are lists of records, with the type of those records."""
-    for field in msgspec.structs.fields(kind):
-        arguments = typing.get_args(_remove_none(field.type))
+    for field in _list_fields(kind):
+        _, _, arguments = _take_apart(field.type)
         if arguments and arguments[-1] is Ellipsis and _is_record(arguments[0]):
             yield field.name, arguments[0]
 

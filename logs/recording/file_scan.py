@@ -26,7 +26,7 @@ from zstandard import ZstdDecompressor, ZstdError, get_frame_parameters
 
 from logs.recording.budget import ExcessError, ReadBudget
 from logs.recording.file_kind import MAGIC, describe_kind_error
-from logs.recording.segment import CHUNK, CHUNK_FIELDS, COMPRESSION, INDEX, MESSAGE, STORED_SIZE, ZERO_UTC
+from logs.recording.segment import COMPRESSION, INDEX, MESSAGE, ZERO_UTC
 from logs.recording.topics import Definition, get_definition
 from uavctl.errors import RecordingError
 
@@ -151,6 +151,10 @@ def _make_definition(channel: Channel, schema: Schema | None) -> Definition:
         return Definition(channel.topic, channel.message_encoding)
 
 
+# Opcode, length, first time, last time, size, CRC-32, length of the compression's name; then name and stored size.
+_CHUNK = struct.Struct("<BQQQQII")
+_STORED_SIZE = struct.Struct("<Q")
+_CHUNK_FIELDS = 40  # least length: that of an empty chunk without compression
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, crc
 _DATA_END = struct.Struct("<BQI")
 _CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
@@ -380,7 +384,7 @@ def _measure_record(data: Buffer, at: int) -> int:
     if opcode == _IS_INDEX:  # of each topic in each chunk, so most of all
         is_complete = length >= 6 and INDEX.unpack_from(data, at)[3] == length - 6
     elif opcode == Opcode.CHUNK:
-        is_complete = length >= CHUNK_FIELDS
+        is_complete = length >= _CHUNK_FIELDS
     elif opcode == Opcode.DATA_END:
         is_complete = length == _DATA_END.size - _RECORD.size
     elif opcode == Opcode.ATTACHMENT:
@@ -404,8 +408,8 @@ def _read_attachment(data: Buffer, at: int, length: int, budget: ReadBudget) -> 
         raise _BadRecordError("has a wrong checksum")
     name, begin = _read_text(data, at + _RECORD.size + _TIMES_BYTES, end)
     media_type, begin = _read_text(data, begin, end)
-    data_bytes = end - begin - STORED_SIZE.size
-    if data_bytes < 0 or data_bytes != STORED_SIZE.unpack_from(data, begin)[0]:
+    data_bytes = end - begin - _STORED_SIZE.size
+    if data_bytes < 0 or data_bytes != _STORED_SIZE.unpack_from(data, begin)[0]:
         raise _BadRecordError("is no attachment")
     return AttachedFile(name, media_type, data_bytes)
 
@@ -439,12 +443,12 @@ def _read_chunk(data: Buffer, at: int, length: int, budget: ReadBudget) -> bytes
         _BadRecordError: it is not, or the chunk is damaged otherwise.
         ExcessError: it asks for more than the budget has.
     """
-    _, _, first, last, size, crc, name_length = CHUNK.unpack_from(data, at)
-    name_at = at + CHUNK.size
-    begin = name_at + name_length + STORED_SIZE.size
+    _, _, first, last, size, crc, name_length = _CHUNK.unpack_from(data, at)
+    name_at = at + _CHUNK.size
+    begin = name_at + name_length + _STORED_SIZE.size
     if name_length not in (0, len(COMPRESSION)) or begin > at + length or first > last:
         raise _BadRecordError("has a damaged head")
-    name, (stored,) = data[name_at : name_at + name_length], STORED_SIZE.unpack_from(data, name_at + name_length)
+    name, (stored,) = data[name_at : name_at + name_length], _STORED_SIZE.unpack_from(data, name_at + name_length)
     if stored != at + length - begin or (size != stored and not name) or name not in (b"", COMPRESSION):
         raise _BadRecordError("has a damaged head (or a compression that no recording of uavctl has)")
     budget.look(length)

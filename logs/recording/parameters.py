@@ -23,9 +23,6 @@ _LAYOUTS = {
     _HEARTBEAT: MessageLayout(mavlink.MAVLink_heartbeat_message),
     _PARAM_VALUE: MessageLayout(mavlink.MAVLink_param_value_message),
 }
-_V1, _V2 = 0xFE, 0xFD  # first byte of a frame
-_HEAD_BYTES = 10  # enough of one to know its length and message
-_SIGNED, _SIGNATURE_BYTES = 0x01, 13
 _PREFIX = "MAV_PARAM_TYPE_"
 _TYPES = {
     number: entry.name.removeprefix(_PREFIX)
@@ -52,7 +49,7 @@ class ParameterReader:
 
     def __init__(self) -> None:
         self._partial_frames: dict[str, bytes] = {}  # of a link: the frame that its last bytes ended in
-        self._lost: set[str] = set()  # links on which nobody knows where the next frame begins
+        self._is_aligned: dict[str, bool] = {}  # whether the next byte of a link should begin a frame
         self._earlier_values: dict[str, VehicleParameter] = {}  # told before the recording began
         self._values: dict[tuple[int, int, str], tuple[float, int]] = {}
         self._counts: dict[tuple[int, int], int] = {}  # parameters that each says it has
@@ -72,31 +69,13 @@ class ParameterReader:
             self._take_bytes(record)
 
     def _take_bytes(self, datagram: Datagram) -> None:
-        data, at = datagram.data, 0
-        if datagram.link in self._partial_frames:
-            data = self._partial_frames.pop(datagram.link) + data
-        elif datagram.link not in self._lost:
-            at = _find_frame(data)
-        while at < len(data):
-            begin = _find_next_frame(data, at)
-            if begin > at:
-                self._lost.add(datagram.link)
-            length = _measure_frame(data, begin)
-            if length is None or begin + length > len(data):
-                self._partial_frames[datagram.link] = data[begin:]
-                return
-            end = begin + length
-            message = data[begin + 5] if data[begin] == _V1 else int.from_bytes(data[begin + 7 : begin + 10], "little")
-            # Checksums take time: where frame follows frame, only those that are read need theirs.
-            looked_at = message in _LAYOUTS or datagram.link in self._lost
-            frames = scan_frames(data[begin:end], final=True).frames if looked_at else []
-            if frames and len(frames[0].data) == length:
-                self._read(message, frames[0].data)
-                self._lost.discard(datagram.link)
-            elif looked_at or (end < len(data) and data[end] not in (_V1, _V2)):
-                self._lost.add(datagram.link)
-                end = begin + 1
-            at = end
+        data = self._partial_frames.pop(datagram.link, b"") + datagram.data
+        scan = scan_frames(data, final=False, is_aligned=self._is_aligned.get(datagram.link, True))
+        if scan.consumed < len(data):
+            self._partial_frames[datagram.link] = data[scan.consumed :]
+        self._is_aligned[datagram.link] = scan.is_aligned
+        for frame in scan.frames:
+            self._read(frame.message_id, frame.data)
 
     def _read(self, message_id: int, frame: bytes) -> None:
         if message_id not in _LAYOUTS:
@@ -189,29 +168,3 @@ def _read_value(value: float, kind: int, *, bytewise: bool) -> int | float:
     if form is not None and math.isfinite(value):
         return round(value)
     return float(str(np.float32(value)))
-
-
-def _find_frame(data: bytes) -> int:
-    """Return where the first frame begins that may tell something: most datagrams are whole frames that do not."""
-    at, last = 0, len(data) - _HEAD_BYTES
-    while at <= last and data[at] == _V2 and int.from_bytes(data[at + 7 : at + 10], "little") not in _LAYOUTS:
-        end = at + 12 + data[at + 1] + (_SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0)
-        if end > len(data) or (end < len(data) and data[end] not in (_V1, _V2)):
-            break
-        at = end
-    return at
-
-
-def _find_next_frame(data: bytes, at: int) -> int:
-    """Return where the next frame may begin, from `at` on; the end if nowhere."""
-    starts = [start for marker in (_V1, _V2) if (start := data.find(marker, at)) >= 0]
-    return min(starts, default=len(data))
-
-
-def _measure_frame(data: bytes, at: int) -> int | None:
-    """Return the length of the frame that begins at `at` [bytes]; None while too little of it is there."""
-    if len(data) - at < _HEAD_BYTES:
-        return None
-    if data[at] == _V1:
-        return 8 + data[at + 1]
-    return 12 + data[at + 1] + (_SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0)

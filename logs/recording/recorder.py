@@ -1,8 +1,7 @@
 """Recorder: a bounded queue of records, the messages for viewers made beside them, and notes on what was lost.
 
 A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing, records
-wait in the queue, as long as there is room in it. Before the disk is full the file is closed in order, and recording
-rests. Views take most of the time and are not needed to decide alike, so they may come later than their records.
+wait in the queue, as long as there is room in it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Protocol
 import msgspec
 
 from logs.recording import attachments
-from logs.recording.disk import DiskFile, FreeSpaceMonitor, OutputFile, find_later_segments, get_free_bytes
+from logs.recording.disk import DiskFile, OutputFile, find_later_segments, get_free_bytes
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader
 from logs.recording.segment import Rotation
@@ -97,9 +96,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     waiting: int  # records in memory
     dropped: int  # records that found the queue full, or came after the end
     refused: int  # records that could not be encoded
-    gone: int  # records in files that somebody has removed or replaced since
     failures: int  # failed writes
-    reason: str  # what is wrong now, or was last (a failed write, a rest); "" while nothing was
+    reason: str  # what is wrong now, or was last (a failed write); "" while nothing was
     refusal: str  # of the newest refused record
     bytes: int  # on the disk
     segments: tuple[str, ...]  # files with at least one chunk
@@ -122,7 +120,6 @@ class WriteQueue:
 
     Attributes:
         queue: topic, log time [ns] and record of what waits; who appends keeps to `log.queue`.
-        views_due: records, with their messages, whose messages for viewers are not made yet.
         closed: no more records will come.
         finished: all that could be done is done.
 
@@ -146,8 +143,9 @@ class WriteQueue:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{path.parent}: {error.strerror}; choose another folder") from error
-        self._free_space = FreeSpaceMonitor(path.parent, free, log.low_bytes, log.stop_bytes)
-        self._free_space.check()
+        self._folder, self._free, self._low_bytes = path.parent, free, log.low_bytes
+        self._is_low, self._free_text = False, ""
+        self._check_free_space()
         self._files = Rotation(path, log, open_file, clock)
         self._parameters = ParameterReader()
         self._clock = clock
@@ -161,7 +159,6 @@ class WriteQueue:
         self._refused = 0
         self._refusal = ""
         self.queue: deque[tuple[str, int, Record]] = deque()
-        self.views_due: deque[tuple[str, int, Record, bytes]] = deque()
         self.closed = self.finished = False
 
     def drop(self) -> None:
@@ -169,20 +166,13 @@ class WriteQueue:
         with self._drop_lock:
             self._dropped += 1
 
-    def drain(self, records: int, views: int) -> None:
-        """Write up to `records` waiting records, and once a second wait until the disk has them.
-
-        Args:
-            views: records whose messages for viewers are made then, these or earlier ones.
-        """
+    def drain(self, records: int) -> None:
+        """Write up to `records` waiting records and what is derived from them; once a second wait for the disk."""
         due = self._clock() >= self._next_look_s
         if due:
             self._next_look_s = self._clock() + LOOK_S
-            self._free_space.check()
-            self._pause()
+            self._check_free_space()
         try:
-            if due:
-                self._files.check_files()
             if self._files.unwritten and self._open_next_file():
                 self._files.write_unwritten()
             if self._files.is_open and self._dropped and not self._noted[0]:
@@ -192,10 +182,6 @@ class WriteQueue:
                 if not (files.has_room or self._open_next_file()):
                     return
                 self._write_message(*self.queue.popleft())
-            for _ in range(min(views, len(self.views_due))):
-                if not (files.has_room or self._open_next_file()):
-                    return
-                self._write_derived(*self.views_due.popleft())
             if due and self._files.is_open:
                 self._note_changes()
                 self._files.sync()
@@ -212,11 +198,9 @@ class WriteQueue:
         self.closed = True
         for _ in range(LAST_TRIES):
             self._files.allow_retry()
-            self.drain(len(self.queue), len(self.views_due) + len(self.queue))
+            self.drain(len(self.queue))
             if self._files.is_open:
                 self._finish_file(NoteKind.END, "end")
-        with suppress(OSError):  # None is open
-            self._files.check_files()
         self.finished = True
 
     def status(self) -> RecorderStatus:
@@ -224,15 +208,14 @@ class WriteQueue:
         files = self._files
         parts = files.parts()
         waiting = len(self.queue) + files.open_messages
-        lost = self._dropped + self._refused + files.gone_records + (waiting if self.closed else 0)
+        lost = self._dropped + self._refused + (waiting if self.closed else 0)
         stuck = bool(files.reason) and not self.closed and not files.has_chunk
         hangs = self.closed and not self.finished
         unwritten_s = max(0.0, self._clock() - self._written_s) if waiting or hangs else 0.0
         is_late = hangs or unwritten_s > LATE_S
         reasons = (
-            (bool(files.gone), f"{', '.join(files.gone)} deleted, moved or replaced"),
             (is_late, f"the recording was last written {unwritten_s:.1f} s ago"),
-            (bool(files.reason) and not (files.gone and not stuck), files.reason),
+            (bool(files.reason), files.reason),
         )
         return RecorderStatus(
             ok=not lost and not stuck and not is_late,
@@ -240,44 +223,40 @@ class WriteQueue:
             waiting=waiting,
             dropped=self._dropped,
             refused=self._refused,
-            gone=files.gone_records,
             failures=files.failures,
             reason="; ".join(text for holds, text in reasons if holds),
             refusal=self._refusal,
             bytes=sum(size for _, _, size in parts),
             segments=tuple(str(path) for path, _, _ in parts),
-            warning=self._free_space.text if self._free_space.low else "",
+            warning=self._free_text if self._is_low else "",
             unwritten_s=unwritten_s,
             unseen=self._derived_topics.unseen,
         )
+
+    def _check_free_space(self) -> None:
+        """Look at the free space; nothing changes if the system cannot tell it."""
+        free = self._free(self._folder)
+        if free is not None:
+            self._is_low, self._free_text = free < self._low_bytes, f"{free} bytes free in {self._folder}"
 
     def _open_next_file(self) -> bool:
         """Return whether there is a file to write to; one is begun if something waits for it."""
         files = self._files
         if files.has_room:
             return True
-        waits = bool(self.queue or self.views_due or files.unwritten)
+        waits = bool(self.queue or files.unwritten)
         if waits and files.is_open:
             files.because = f"goes on after {files.name}"
             self._finish_file(NoteKind.CONTINUED, "goes on in the next file")
         if files.is_open:
             return True
-        if not waits or not files.may_begin or (self._free_space.is_paused and not self.closed):
+        if not waits or not files.may_begin:
             return False
         head = self.queue[0][2] if self.queue else None
         if isinstance(head, Header):  # it comes first, and tells the time of all that follows
             files.zero_utc_ns = head.zero_utc_ns or 0
         files.begin(self._write_note)
         return True
-
-    def _pause(self) -> None:
-        """Close the file in order while the disk still has room for that."""
-        if not self._free_space.is_paused or self.closed:
-            return
-        self._files.reason = self._free_space.text
-        if self._files.is_open:
-            self._files.because = f"after a rest: {self._free_space.text}"
-            self._finish_file(NoteKind.STATE, self._free_space.text)
 
     def _write_message(self, topic: str, at_ns: int, record: Record) -> None:
         if isinstance(record, Datagram):
@@ -288,8 +267,8 @@ class WriteQueue:
             self._refused += 1
             self._refusal = str(error)
             return
-        self.views_due.append((topic, at_ns, record, data))
-        self._files.write_record(topic, at_ns, data)
+        derived = self._derived_topics.derive_messages(topic, at_ns, record, data)
+        self._files.write_record(topic, at_ns, data, derived)
         if topic == HEADER:
             self._write_note("begin", NoteKind.BEGIN)
             self._files.commit()
@@ -301,26 +280,18 @@ class WriteQueue:
         else:
             self._parameters.take(record)
 
-    def _write_derived(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
-        """Write the messages for viewers that are derived from a record."""
-        messages = self._derived_topics.derive_messages(topic, at_ns, record, data)
-        if messages:
-            self._files.unwritten.extend(messages)
-            self._files.write_unwritten()
-
     def _note_changes(self) -> None:
         if (self._dropped, self._refused) != self._noted:
             self._publish_note("records lost" + (f"; newest refusal: {self._refusal}" if self._refusal else ""))
-        if self._free_space.low != self._is_low_noted:
-            self._is_low_noted = self._free_space.low
-            self._publish_note(
-                f"disk {'gets low' if self._is_low_noted else 'has room again'}: {self._free_space.text}"
-            )
+        if self._is_low != self._is_low_noted:
+            self._is_low_noted = self._is_low
+            self._publish_note(f"disk {'gets low' if self._is_low else 'has room again'}: {self._free_text}")
 
     def _publish_note(self, text: str) -> None:
         """Write a note, which watchers see too."""
         note = self._write_note(text)
-        self._write_derived(RECORDER, note.at_ns, note, encode(note))
+        self._files.unwritten.extend(self._derived_topics.derive_messages(RECORDER, note.at_ns, note, encode(note)))
+        self._files.write_unwritten()
 
     def _write_note(self, text: str, kind: NoteKind = NoteKind.STATE) -> RecorderNote:
         self._noted = (self._dropped, self._refused)
@@ -350,14 +321,9 @@ class WriteQueue:
 
 
 POLL_S = 0.02
-# What a round may take, so that the interpreter, which a tick waits for, is free again after 3 ms at most. Records come
-# first, at 8 us each: unless more than RECORDS waited, the queue then holds nothing that was there when the round
-# began, and a kill loses little of what a busy computer has left behind. Their messages for viewers, three times as
-# dear, can wait. A round every POLL_S makes 1600 records a second with views, several times what a flight has. Of a
-# larger backlog, which a slow disk has left, a share.
-RECORDS = 256
-VIEWS = 32
-BACKLOG_SHARE = 8
+# Records of a round. Each takes some 30 us with its messages for viewers, so that the interpreter, which a tick waits
+# for, is free again after 2 ms. A round every POLL_S makes 3200 records a second, several times what a flight has.
+RECORDS = 64
 
 
 class _Base:
@@ -403,7 +369,7 @@ class SyncRecorder(_Base):
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """Record one value under a topic; whatever goes wrong is in `status()`."""
         super().put(topic, at_ns, record)
-        self._journal.drain(self._log.queue, self._log.queue)
+        self._journal.drain(self._log.queue)
 
     def close(self) -> RecorderStatus:
         """Write the rest, the index and the footer; later records are dropped."""
@@ -461,12 +427,5 @@ class Recorder(_Base):
             self._due.wait(POLL_S)
             self._due.clear()
             with suppress(Exception):  # no memory, say: the next round tries again
-                journal.drain(
-                    compute_batch_size(len(journal.queue), RECORDS), compute_batch_size(len(journal.views_due), VIEWS)
-                )
+                journal.drain(RECORDS)
         journal.finish()
-
-
-def compute_batch_size(waiting: int, at_once: int) -> int:
-    """Return how many of `waiting` records are taken in a round: `at_once`, or a share of a large backlog."""
-    return max(at_once, waiting // BACKLOG_SHARE)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
 import struct
 import zlib
 from collections import Counter, deque
@@ -30,6 +29,8 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
+    Chunk,
+    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -42,25 +43,17 @@ from mcap.records import (
 from mcap.records import SummaryOffset as Group
 from zstandard import ZstdCompressor
 
-from logs.recording.disk import OutputFile, is_present, make_segment_path
+from logs.recording.disk import OutputFile, make_segment_path
 from logs.recording.file_kind import MAGIC
-from logs.recording.topics import HEADER, Definition, get_definition, is_view
+from logs.recording.topics import HEADER, Definition, get_definition
 from uavctl.config.types import LogConfig
 
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _MESSAGE_FIELDS = 22  # bytes of a message record besides its data
 _OPCODE = int(Opcode.MESSAGE)
 INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
-# Opcode, length, first time, last time, size, CRC-32, length of the compression's name; then name and stored size.
-CHUNK = struct.Struct("<BQQQQII")
-STORED_SIZE = struct.Struct("<Q")
-CHUNK_FIELDS = 40  # least length: that of an empty chunk without compression
 COMPRESSION = b"zstd"
 _LEVEL = 1  # 3 makes a flight's recording 1 % smaller for twice the time
-_CHUNK_INDEX = struct.Struct("<BQQQQQI")  # opcode, length, first and last time, start, length, bytes of offsets
-_OFFSET = struct.Struct("<HQ")  # channel, where its index is
-_CHUNK_INDEX_END = struct.Struct(f"<QI{len(COMPRESSION)}sQQ")  # bytes of the indexes, compression, sizes
-_CHUNK_INDEX_FIELDS = 64 + len(COMPRESSION)
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of its offsets
 # Metadata of each channel: UTC of time 0 of our clock [ns since 1970], that log times are later than the records' own.
 # In each chunk, as all of a channel is, and so there whatever else of the file is damaged.
@@ -111,12 +104,6 @@ class Segment:
         self.messages = 0  # on the disk
         self.bytes = 0  # on the disk
         self.attached_bytes = 0  # of these, attachments and metadata
-
-    @property
-    def records(self) -> int:
-        """Messages on the disk, without those for viewers."""
-        counts = self._counts.copy()
-        return sum(counts[channel.number] for topic, channel in [*self._channels.items()] if not is_view(topic))
 
     def add(self, entry: QueuedMessage) -> None:
         """Take a message; writes the open chunk first if it would grow too large.
@@ -220,14 +207,6 @@ class Segment:
             self._file.truncate(self.bytes)
             raise
 
-    def close_missing(self) -> None:
-        """Close a file that nobody can find any more.
-
-        Raises:
-            OSError: that could not be done.
-        """
-        self._file.close()
-
     def _make_prefix(self) -> bytes:
         """Return the bytes that the next write has to begin with: those that begin a file, or none."""
         return b"" if self.bytes else MAGIC + _pack_records(Header(profile="", library=_name_library()))
@@ -265,33 +244,43 @@ class Segment:
         times_ns = [entry.at_ns + self._zero_utc_ns for entry in entries]
         first, last = min(times_ns), max(times_ns)
         size, stored = len(content), self._compress(content)
-        fields = CHUNK_FIELDS + len(COMPRESSION) + len(stored)
-        head = CHUNK.pack(Opcode.CHUNK, fields, first, last, size, zlib.crc32(content), len(COMPRESSION))
-        head += COMPRESSION + STORED_SIZE.pack(len(stored))
-        length = len(head) + len(stored)
+        chunk = _pack_records(
+            Chunk(
+                compression=COMPRESSION.decode(),
+                data=stored,
+                message_start_time=first,
+                message_end_time=last,
+                uncompressed_crc=zlib.crc32(content),
+                uncompressed_size=size,
+            )
+        )
         prefix = self._make_prefix()
         start = self.bytes + len(prefix)
-        at, offsets = start + length, []
-        indexes = []
+        at = start + len(chunk)
+        offsets, indexes = {}, []
         for channel_id, flat in self._indexes.items():
-            offsets.append(_OFFSET.pack(channel_id, at))
+            offsets[channel_id] = at
             indexes.append(
                 INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
                 + struct.pack(f"<{len(flat)}Q", *flat)
             )
             at += len(indexes[-1])
-        block = b"".join([prefix, head, stored, *indexes])
+        block = b"".join([prefix, chunk, *indexes])
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
         self.bytes += len(block)
-        offset_bytes = b"".join(offsets)
-        fields = _CHUNK_INDEX_FIELDS + len(offset_bytes)
-        self._chunk_indexes += _CHUNK_INDEX.pack(
-            Opcode.CHUNK_INDEX, fields, first, last, start, length, len(offset_bytes)
-        )
-        self._chunk_indexes += offset_bytes
-        self._chunk_indexes += _CHUNK_INDEX_END.pack(
-            at - start - length, len(COMPRESSION), COMPRESSION, len(stored), size
+        self._chunk_indexes += _pack_records(
+            ChunkIndex(
+                chunk_start_offset=start,
+                chunk_length=len(chunk),
+                compression=COMPRESSION.decode(),
+                compressed_size=len(stored),
+                uncompressed_size=size,
+                message_start_time=first,
+                message_end_time=last,
+                message_index_length=at - start - len(chunk),
+                message_index_offsets=offsets,
+            )
         )
         self._chunks += 1
         earlier_times_ns = self._times_ns or (first, last)
@@ -379,7 +368,6 @@ class _SegmentPart(NamedTuple):
     path: Path
     messages: int
     bytes: int
-    records: int  # messages that were not made for viewers
 
 
 class Rotation:
@@ -395,9 +383,7 @@ class Rotation:
         written: messages so far, repeated ones included.
         at_ns: log time of the newest record.
         failures: failed writes.
-        reason: reason of the newest failed write, or why recording pauses.
-        gone: names of files that were written and are no longer there.
-        gone_records: number of records in those files.
+        reason: reason of the newest failed write.
         zero_utc_ns: UTC of time 0 of our clock [ns since 1970], for the files that are begun from now on.
     """
 
@@ -411,10 +397,7 @@ class Rotation:
         self._header_bytes = 0  # its size in a file
         self._attachments: tuple[Attachment | Metadata, ...] = ()  # for each segment
         self._retry_s = clock()
-        self._opened: os.stat_result | None = None  # what the open file is
         self._done: list[_SegmentPart] = []
-        self.gone: list[str] = []
-        self.gone_records = 0
         self.unwritten: deque[tuple[str, int, bytes]] = deque()
         self.zero_utc_ns = 0
         self.because = ""
@@ -466,19 +449,6 @@ class Rotation:
             done.append(self._part(segment))
         return [(file.path, file.messages, file.bytes) for file in done]
 
-    def check_files(self) -> None:
-        """Check that the files written so far are still where they were made.
-
-        Raises:
-            OSError: the open file is not; closed ones are remembered as gone.
-        """
-        for part in [*self._done]:
-            if not is_present(part.path, part.bytes):
-                self._done.remove(part)
-                self._count_lost(part)
-        if self._segment is not None and not self._is_present(self._segment):
-            raise FileNotFoundError(errno.ENOENT, "the file was deleted, moved or replaced", self.name)
-
     def allow_retry(self) -> None:
         """Allow that a file is begun at once."""
         self._retry_s = self._clock()
@@ -491,7 +461,6 @@ class Rotation:
         """
         self._path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
         self._segment = Segment(self._open_next(), self._log.chunk_bytes, self.zero_utc_ns)
-        self._opened = make_segment_path(self._path, self.number).stat()
         self._preface = 0
         if self.number > 1:
             self._preface = 1 + bool(self._header)
@@ -523,8 +492,8 @@ class Rotation:
             if segment.open_entries and segment.open_entries[-1] is entry:  # else it is lost, and takes no number
                 self.written += 1
 
-    def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
-        """Add a record's message; the header is kept for later files.
+    def write_record(self, topic: str, at_ns: int, data: bytes, derived: Sequence[tuple[str, int, bytes]] = ()) -> None:
+        """Add a record's message and those derived from it; the header is kept for later files.
 
         Raises:
             OSError: as `write`.
@@ -533,7 +502,8 @@ class Rotation:
         if topic == HEADER:
             self._header = data
             self._header_bytes = len(ZstdCompressor(level=_LEVEL).compress(data))
-        self.write(topic, at_ns, data)
+        self.unwritten.extend(((topic, at_ns, data), *derived))
+        self.write_unwritten()
 
     def write_unwritten(self) -> None:
         """Write the messages that must go first into the new file.
@@ -558,8 +528,8 @@ class Rotation:
         """Write attachments and metadata into this file, after its chunk.
 
         Args:
-            each: what the files that follow get, too.
-            once: what only this one gets.
+            file_records: those of this file and all that follow.
+            recording_records: those of this file alone.
 
         Raises:
             OSError: they could not be written.
@@ -571,8 +541,10 @@ class Rotation:
         """Write the open chunk and wait until the disk has it.
 
         Raises:
-            OSError: that could not be done.
+            OSError: that could not be done, or the file is no longer where it was made.
         """
+        if not make_segment_path(self._path, self.number).exists():
+            raise FileNotFoundError(errno.ENOENT, "the file was deleted or moved", self.name)
         self._open_segment().sync()
 
     def finish(self, records: Sequence[Attachment | Metadata] = ()) -> None:
@@ -584,7 +556,7 @@ class Rotation:
         segment = self._open_segment()
         segment.attach(records)
         segment.finish()
-        self._retire(segment, there=self._is_present(segment))
+        self._retire(segment)
 
     def fail(self, error: Exception) -> None:
         """Handle a failed write: keep the messages of the open chunk, and close the file as well as possible."""
@@ -601,34 +573,21 @@ class Rotation:
             (record.definition.topic, record.at_ns, record.data) for record in reversed(kept_entries)
         )
         # what abandon cannot do is no second alarm: whole chunks are readable without it
-        there = self._is_present(segment)
         with contextlib.suppress(OSError):
-            segment.abandon() if there else segment.close_missing()
-        self._retire(segment, there=there)
+            segment.abandon()
+        self._retire(segment)
 
     def _open_segment(self) -> Segment:
         assert self._segment is not None  # who calls has asked is_open
         return self._segment
 
     def _part(self, segment: Segment) -> _SegmentPart:
-        return _SegmentPart(
-            make_segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records
-        )
+        return _SegmentPart(make_segment_path(self._path, self.number), segment.messages, segment.bytes)
 
-    def _count_lost(self, part: _SegmentPart) -> None:
-        self.gone.append(part.path.name)
-        self.gone_records += part.records
-
-    def _is_present(self, segment: Segment) -> bool:
-        return is_present(make_segment_path(self._path, self.number), segment.bytes, self._opened)
-
-    def _retire(self, segment: Segment, *, there: bool) -> None:
+    def _retire(self, segment: Segment) -> None:
         part = self._part(segment)
         if segment.bytes:
-            if there:
-                self._done.append(part)
-            else:
-                self._count_lost(part)
+            self._done.append(part)
             self.number += 1
         else:
             try:

@@ -1,12 +1,10 @@
 """3D scenes of a flight in Foxglove's messages, all in local NED; viewers turn it (topic /view/frames).
 
 The parts of a message are made as its fields, to be put in once: a message in a message would be copied at each depth.
-Those of which there is one a stage are filled in (`Many`).
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import product
@@ -19,7 +17,6 @@ from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 
@@ -50,29 +47,6 @@ from uavctl.records import (
     Vec3,
     VehicleStatus,
 )
-
-
-class RepeatedField:
-    """Bytes of a repeated field, to be merged into the message that has it.
-
-    Args:
-        made: A message with the field once, and nothing else; the argument is the part's numbers (k,), doubles all.
-    """
-
-    def __init__(self, make_message: Callable[[Sequence[float]], Message], count: int) -> None:
-        marks = [math.pi * (1 + i) for i in range(count)]
-        data = make_message(marks).SerializeToString()
-        self._template = np.frombuffer(data, dtype=np.uint8)
-        starts = [data.index(np.array(mark, dtype="<f8").tobytes()) for mark in marks]
-        self._at = np.add.outer(starts, np.arange(8)).ravel()
-
-    def encode(self, numbers: Array) -> bytes:
-        """Return the field with one part for each row of the numbers (n, k)."""
-        rows = np.empty((len(numbers), self._template.size), dtype=np.uint8)
-        rows[:] = self._template
-        rows[:, self._at] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
-        return rows.tobytes()
-
 
 Fields = dict[str, Any]  # of a message within another
 M = TypeVar("M", bound=Message)
@@ -134,9 +108,8 @@ def make_pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
 
 def make_poses_in_frame(at_ns: int, places_m: Array) -> PosesInFrame:
     """Return places in local NED [m] (n, 3) as poses with their frame, in order."""
-    message = _make_message(PosesInFrame, timestamp=make_timestamp(at_ns), frame_id=NED)
-    message.MergeFromString(_POSES.encode(places_m))
-    return message
+    poses = [make_pose(at_m) for at_m in places_m.tolist()]
+    return _make_message(PosesInFrame, timestamp=make_timestamp(at_ns), frame_id=NED, poses=poses)
 
 
 def make_frames(at_ns: int) -> FrameTransforms:
@@ -187,19 +160,17 @@ def draw_plan(
     `places` are the positions of the plan's states, where they are at hand.
     """
     places = design.positions_of(plan.states) if positions is None else positions
-    spread = np.concatenate([places, 2.0 * _compute_semi_axes(design, plan.backoff_x)], axis=1)
+    diameters = 2.0 * _compute_semi_axes(design, plan.backoff_x)
+    spheres = [_make_ellipsoid(*stage) for stage in zip(places.tolist(), diameters.tolist(), strict=True)]
     lower, upper = _get_room_sides(design, *tighten_limits(design, plan.backoff_x, -1))
     entities = [
-        _make_entity(at_ns, "predicted path", lines=[_make_line((), _PLANNED, 3.0)]),
-        _make_entity(at_ns, "predicted spread"),
+        _make_entity(at_ns, "predicted path", lines=[_make_line(places.tolist(), _PLANNED, 3.0)]),
+        _make_entity(at_ns, "predicted spread", spheres=spheres),
         _make_entity(at_ns, "limits less back-offs", lines=[_make_box(lower, upper, _TIGHT)]),
     ]
     if estimate is not None:
         entities.append(_make_entity(at_ns, "estimate, 95 %", spheres=[_draw_estimate_ellipsoid(design, estimate)]))
-    scene = _make_update(*entities)
-    scene.entities[0].lines[0].MergeFromString(_POINTS.encode(places))
-    scene.entities[1].MergeFromString(_SPHERES.encode(spread))
-    return scene
+    return _make_update(*entities)
 
 
 def draw_path(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -> SceneUpdate:
@@ -283,6 +254,10 @@ def _compute_semi_axes(design: DesignView, backoff: Array) -> Array:
     return design.positions_of(reach)
 
 
+def _make_ellipsoid(at_m: Sequence[float], size_m: Sequence[float], turn: Fields = _LEVEL) -> Fields:
+    return {"pose": make_pose(at_m, turn), "size": make_vector(size_m), "color": _SPREAD}
+
+
 def _draw_estimate_ellipsoid(design: DesignView, estimate: Estimate) -> Fields:
     """Draw the ellipsoid that holds the position with 95 %, by the covariance."""
     cov = [[0.0] * 3 for _ in range(3)]
@@ -293,18 +268,7 @@ def _draw_estimate_ellipsoid(design: DesignView, estimate: Estimate) -> Fields:
     variances, directions = np.linalg.eigh(cov)
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
     turn = make_quaternion(quaternion_from_axes(directions.T.tolist()))
-    at = make_pose(design.position_of(estimate.mean), turn)
-    return {"pose": at, "size": make_vector([2 * semi_axis for semi_axis in semi_axes_m.tolist()]), "color": _SPREAD}
-
-
-_POSES = RepeatedField(lambda at_m: _make_message(PosesInFrame, poses=[make_pose(at_m)]), 3)
-_POINTS = RepeatedField(lambda at_m: _make_message(LinePrimitive, points=[make_vector(at_m)]), 3)
-_SPHERES = RepeatedField(
-    lambda of: _make_message(
-        SceneEntity, spheres=[{"pose": make_pose(of[:3]), "size": make_vector(of[3:]), "color": _SPREAD}]
-    ),
-    6,
-)
+    return _make_ellipsoid(design.position_of(estimate.mean), (2 * semi_axes_m).tolist(), turn)
 
 
 STILL_NS = 5_000_000_000  # what does not move is told again: for viewers that come late, and files begun later

@@ -19,7 +19,6 @@ from uavctl.errors import ConfigError
         ("t.a = 1\nt.a = 2\n", "t.a", 1, 2),
         ("t.a = 1\n[t]\nb = 1\n", "t", 1, 2),
         ("[t.a]\nb = 1\n[t]\na = 2\n", "t.a", 1, 4),
-        ("t = {a = 1, a = 2}\n", "t.a", 1, 1),
         ("t = {a = 1}\n[t.b]\nc = 1\n", "t", 1, 2),
         ("t = {a = 1}\nt.c = 1\n", "t", 1, 2),
         ("a = [\n1,\n2]\na = [\n3,\n4]\n", "a", 1, 4),

@@ -34,7 +34,7 @@ def motion(tmp_path: Path, text: str) -> tuple[tuple[float, ...], ...]:
         "t [s],y [m],x [m],z [m]\n0,-0.5,0.5,-1\n1,-0.4,0.6,-1.1\n",
         "t  ( ms ) ,pos_x  [ m ],pos_y [],pos_z (  )\n0,0.5,-0.5,-1\n1000,0.6,-0.4,-1.1\n",
         "t (ms),pos_x,pos_y,pos_z\n0,0.5,-0.5,-1\n1000,0.6,-0.4,-1.1\n",
-        "up,east,north,time\nm,cm,m,s\n1,-50,0.5,0\n1.1,-40,0.6,1\n",
+        "up,east cm,north,time\n1,-50,0.5,0\n1.1,-40,0.6,1\n",
         "# t x y z\n0,0.5,-0.5,-1\n1,0.6,-0.4,-1.1\n",
         "# t_s y_m x_m z_m\n0,-0.5,0.5,-1\n1,-0.4,0.6,-1.1\n",
         "# by hand\n0,0.5,-0.5,-1\n# then on\n1,0.6,-0.4,-1.1\n",

@@ -86,9 +86,9 @@ def kill_once(folder: Path, kind: str, seed: int, items: list[Item]) -> KillResu
 def _record(path: Path, kind: str, items: list[Item], counts: memoryview) -> None:
     drain = WriteQueue.drain
 
-    def watched(journal: WriteQueue, records: int, views: int) -> None:
+    def watched(journal: WriteQueue, records: int) -> None:
         begun = counts[0] - max(0, len(journal.queue) - AT_ONCE)
-        drain(journal, records, views)
+        drain(journal, records)
         counts[1] = begun
 
     with patch.object(WriteQueue, "drain", watched):

@@ -24,7 +24,7 @@ from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, label_text, print_message
 from uavctl.cli.signals import SIGNAL_EXIT_BASE, stop_on_signals
 from uavctl.daemon.flight_orders import make_goto_keys
-from uavctl.errors import ConnectionClosedError, RecordingError, TickOverdueError, UavctlError, UsageError, in_words
+from uavctl.errors import ConnectionClosedError, TickOverdueError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, Ending, Order
 
@@ -155,8 +155,6 @@ def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: E
         RecordingError: The recording cannot be read, or nothing was flown.
     """
     print_losses(status)
-    if not status.segments and status.gone:
-        raise RecordingError(f"{path}: {status.reason}; nothing of the flight is on the disk")
     with stop_on_signals():
         flight = FlightData.from_records(read(path), path)
         page = path.with_suffix(".html")

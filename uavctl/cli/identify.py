@@ -21,7 +21,7 @@ from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
 from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_progress, warn
 from uavctl.config import Config
-from uavctl.config.load import dump_config, parse
+from uavctl.config.load import dump_config, parse_recorded
 from uavctl.errors import DesignError, UsageError
 from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
 from uavctl.lab.identify.page import render_identify_page
@@ -85,7 +85,7 @@ def _read_history(flight: Path, common: Common, system: int | None) -> tuple[Fli
         raise UsageError("--system is for a .tlog: a recording of ours is of one vehicle")
     if common.overrides or common.config != DEFAULTS.config:
         raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
-    config = parse(read_header(flight).config_toml, f"{flight} (configuration)").config
+    config = parse_recorded(read_header(flight).config_toml, f"{flight} (configuration)").config
     if cut := explain_missing_end(flight):
         warn(f"{cut}: identified from what comes before")
     return read_recorded_history(read(flight)), config

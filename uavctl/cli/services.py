@@ -67,7 +67,7 @@ def make_recorder_health(status: RecorderStatus, path: Path) -> RecorderHealth:
     reason = status.warning if status.ok else status.reason or status.refusal
     return RecorderHealth(
         ok=status.ok,
-        dropped=status.dropped + status.refused + status.gone,
+        dropped=status.dropped + status.refused,
         reason=reason,
         path=str(path),
         unwritten_s=status.unwritten_s,

@@ -28,7 +28,6 @@ from uavctl.config.types import (
     SmpcConfig,
     SolverConfig,
     TargetConfig,
-    check_log,
 )
 from uavctl.frames import suggest_height_sign
 
@@ -516,7 +515,6 @@ _CHECKS: tuple[tuple[tuple[str, ...], CheckFunction], ...] = (
     (("daemon",), check_roles),
     (("daemon", "source"), check_source),
     (("daemon", "security"), check_signing),
-    (("log",), check_log),
     (("sim",), check_sim),
     (("sim", "daemon"), check_system_ids),
     (("plant", "sets", "mission"), check_mission),

@@ -11,54 +11,28 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.document import MAX_PATH_LENGTH, MAX_URL_LENGTH, ConfigProblem, Position, Section
+from uavctl.config.document import MAX_PATH_LENGTH, MAX_URL_LENGTH, ConfigProblem, Position, Section, declare
 
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
     """Requests to the vehicle; nothing here arms: that takes `--arm --takeoff`."""
 
-    answer_s: Annotated[
-        float, Meta(ge=0.2, le=10, description="a request that shows no effect is repeated after this time [s]")
-    ] = 1.0
-    retry_s: Annotated[
-        float, Meta(ge=0.2, le=10, description="a request that was refused for now is repeated after this time [s]")
-    ] = 2.0
-    tries: Annotated[int, Meta(ge=1, le=100, description="times that one request is made at most")] = 30
-    ground_s: Annotated[
-        float,
-        Meta(
-            le=600,
-            ge=0.1,
-            description="time that the vehicle and the positions are given to get ready, and then the mode, and then "
-            "arming [s]",
-        ),
-    ] = 60.0
-    fresh_s: Annotated[
-        float, Meta(le=5, ge=0.001, description="nothing is armed while the newest position is older than this [s]")
-    ] = 1.0
-    climb_s: Annotated[
-        float, Meta(le=120, ge=0.1, description="time for the vehicle's own climb; then it is asked to land [s]")
-    ] = 20.0
-    reached: Annotated[
-        float, Meta(le=1, ge=0.01, description="share of the take-off height at which the climb counts as done")
-    ] = 0.9
+    answer_s: Annotated[float, declare("time until a request without an effect is repeated", "s", 0.2, 10)] = 1.0
+    retry_s: Annotated[float, declare("time until a request that was refused for now is repeated", "s", 0.2, 10)] = 2.0
+    tries: Annotated[int, declare("times that one request is made at most", "", 1, 100)] = 30
+    ground_s: Annotated[float, declare("longest wait for positions, for the mode, for arming", "s", 0.1, 600)] = 60.0
+    fresh_s: Annotated[float, declare("greatest age of the newest position at arming", "s", 0.001, 5)] = 1.0
+    climb_s: Annotated[float, declare("longest climb by the vehicle; then it must land", "s", 0.1, 120)] = 20.0
+    reached: Annotated[float, declare("share of the take-off height that ends the climb", "", 0.01, 1)] = 0.9
     engage_s: Annotated[
-        float,
-        Meta(
-            le=60, ge=0.1, description="time for the external mode in the air; after a take-off, then it must land [s]"
-        ),
+        float, declare("longest wait for the external mode in the air; after our take-off it then lands", "s", 0.1, 60)
     ] = 5.0
-    land_s: Annotated[
-        float, Meta(le=600, ge=0.1, description="time from the landing mode to disarmed, after a take-off of ours [s]")
-    ] = 60.0
-    disarm_s: Annotated[
-        float, Meta(le=60, ge=0.1, description="a vehicle that has landed and stays armed so long is disarmed [s]")
-    ] = 5.0
+    land_s: Annotated[float, declare("longest landing after our take-off, until disarmed", "s", 0.1, 600)] = 60.0
+    disarm_s: Annotated[float, declare("time after which a landed vehicle is disarmed", "s", 0.1, 60)] = 5.0
     origin_deg_m: Annotated[
         Position,
-        Meta(
-            description="latitude, longitude [deg] and altitude [m] told to an ArduPilot that flies by external "
-            "positions and knows no place on the globe, before arming; any will do indoors"
+        declare(
+            "latitude, longitude [deg] and altitude [m] for an ArduPilot without a place on the globe; any will do"
         ),
     ] = (47.397742, 8.545594, 488.0)
 
@@ -120,18 +94,9 @@ def get_camera_system(scheme: str) -> CameraSystem:
 class FrameConfig(Section, frozen=True, kw_only=True):
     """Camera frame to local NED."""
 
-    convention: Annotated[Literal["ned", "enu"], Meta(description="axes of the source's positions")] = "ned"
-    origin_m: Annotated[Position, Meta(description="position of the camera frame's origin in local NED [m]")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
-    yaw_deg: Annotated[
-        float,
-        Meta(
-            ge=-180, le=180, description="heading of the camera frame's first axis (after conversion to NED axes) [deg]"
-        ),
-    ] = 0.0
+    convention: Annotated[Literal["ned", "enu"], declare("axes of the source's positions")] = "ned"
+    origin_m: Annotated[Position, declare("position of the camera frame's origin in local NED", "m")] = (0.0, 0.0, 0.0)
+    yaw_deg: Annotated[float, declare("heading of the camera frame's first axis, in NED axes", "deg", -180, 180)] = 0.0
 
 
 class SourceConfig(Section, frozen=True, kw_only=True):
@@ -144,76 +109,42 @@ class SourceConfig(Section, frozen=True, kw_only=True):
             ],
             ...,
         ],
-        Meta(
-            min_length=1,
-            max_length=10,
-            description="messages that are taken; LOCAL_POSITION_NED is the vehicle's own estimate only if named",
+        declare(
+            "messages that are taken; LOCAL_POSITION_NED, if it is named, is the vehicle's own estimate", length=(1, 10)
         ),
     ] = ("VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY")
-    system_id: Annotated[
-        int, Meta(ge=0, le=255, description="MAVLink system id that positions must come from; 0 takes any")
-    ] = 0
-    rate_hz: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=1000,
-            description="positions a second that the design counts on; 0 counts on one position each Δt [1/s]",
-        ),
-    ] = 0.0
+    system_id: Annotated[int, declare("MAVLink system id that positions must come from; 0 takes any", "", 0, 255)] = 0
+    rate_hz: Annotated[float, declare("positions that the design counts on; 0: one each Δt", "1/s", 0, 1000)] = 0.0
 
 
 class ClockConfig(Section, frozen=True, kw_only=True):
     """The source's clock."""
 
-    latency_s: Annotated[
-        float,
-        Meta(ge=0, le=60, description="smallest delay from capture to arrival, when the peer answers no TIMESYNC [s]"),
-    ] = 0.0
-    window_s: Annotated[
-        float, Meta(ge=0.001, le=600, description="window of the sliding minimum of (received − stamp) [s]")
-    ] = 10.0
-    future_tolerance_s: Annotated[
-        float, Meta(ge=0, le=60, description="a stamp further in the future is refused [s]")
-    ] = 0.02
+    latency_s: Annotated[float, declare("least delay of a position, for a peer without TIMESYNC", "s", 0, 60)] = 0.0
+    window_s: Annotated[float, declare("window of the sliding minimum of (received − stamp)", "s", 0.001, 600)] = 10.0
+    future_tolerance_s: Annotated[float, declare("a stamp further in the future is refused", "s", 0, 60)] = 0.02
 
 
 class DaemonConfig(Section, frozen=True, kw_only=True):
     """The control loop and its connections."""
 
-    tick_s: Annotated[float, Meta(le=0.1, ge=0.001, description="time between setpoints; divides Δt [s]")]
-    vehicle: Annotated[str, Meta(max_length=MAX_URL_LENGTH, description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
+    tick_s: Annotated[float, declare("time between setpoints; divides Δt", "s", 0.001, 0.1)]
+    vehicle: Annotated[str, declare("URL of the vehicle", length=MAX_URL_LENGTH)] = "udpin://0.0.0.0:14540"
     mocap: Annotated[
         str,
-        Meta(
-            max_length=MAX_URL_LENGTH,
-            description="URL of the source of positions; the same URL as the vehicle's is one connection. "
-            "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system, `qualisys://SERVER/BODY` one of Qualisys "
-            "(docs/sources.md), `NAME://SERVER:PORT/BODY` one of another package, by its entry point `uavctl.sources` "
-            "or as `module:Class` (docs/extending.md)",
+        declare(
+            "URL of the source of positions, which may be the vehicle's; `natnet://SERVER/BODY` and "
+            "`qualisys://SERVER/BODY` (docs/sources.md), or `NAME://SERVER:PORT/BODY` of another package "
+            "(docs/extending.md)",
+            length=MAX_URL_LENGTH,
         ),
     ] = "udpin://0.0.0.0:14560"
-    vehicle_system_id: Annotated[
-        int, Meta(ge=0, le=255, description="MAVLink system id of the vehicle; 0 takes the first one that is heard")
-    ] = 0
-    vehicle_component_id: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=255,
-            description="MAVLink component id of the vehicle's autopilot; 0 takes any, and 1 rather than another",
-        ),
-    ] = 0
-    system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245
-    component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (
-        25
-    )
-    radio_channels: Annotated[
-        bool, Meta(description="ask the vehicle for RC_CHANNELS, which show whether a pilot moves a stick")
-    ] = True
-    parameters: Annotated[
-        bool, Meta(description="ask the vehicle for all its parameters before it is armed, for the recording")
-    ] = True
+    vehicle_system_id: Annotated[int, declare("system id of the vehicle; 0: the first one heard", "", 0, 255)] = 0
+    vehicle_component_id: Annotated[int, declare("component id of the autopilot; 0: any, preferably 1", "", 0, 255)] = 0
+    system_id: Annotated[int, declare("MAVLink system id of the daemon", "", 1, 255)] = 245
+    component_id: Annotated[int, declare("MAVLink component id of the daemon (25 = user 1)", "", 1, 255)] = 25
+    radio_channels: Annotated[bool, declare("ask for RC_CHANNELS, which show whether a pilot moves a stick")] = True
+    parameters: Annotated[bool, declare("ask for all parameters before arming, for the recording")] = True
 
 
 MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
@@ -224,56 +155,38 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
 
     key_file: Annotated[
         str,
-        Meta(
-            max_length=MAX_PATH_LENGTH,
-            description="file of the signing key, from `/` or `~` on, readable by its owner only (`uavctl key new` "
-            "makes one); empty neither signs nor verifies",
+        declare(
+            "file of the signing key, absolute or from `~`, readable by its owner only (`uavctl key new`); "
+            "empty: nothing is signed",
+            length=MAX_PATH_LENGTH,
         ),
     ] = ""
     require: Annotated[
         tuple[Literal["vehicle", "mocap"], ...],
-        Meta(
-            min_length=1,
-            max_length=2,
-            description="connections on which, with a key, only signed frames are taken and ours are signed; one for "
-            'both roles is the "vehicle"',
+        declare(
+            "connections on which, with a key, all frames are signed; one connection for both is `vehicle`",
+            length=(1, 2),
         ),
     ] = ("vehicle", "mocap")
-    link_id: Annotated[
-        int, Meta(ge=0, le=254, description="our link id on the vehicle's connection; the cameras' is one more")
-    ] = 0
+    link_id: Annotated[int, declare("link id of the vehicle's connection; the cameras' is one more", "", 0, 254)] = 0
     peer_link_ids: Annotated[
         tuple[Annotated[int, Meta(ge=0, le=255)], ...],
-        Meta(max_length=256, description="link ids that peers may sign with; none takes the first that each one uses"),
+        declare("link ids that peers may sign with; none: the first that each one uses", length=256),
     ] = ()
     allow: Annotated[
-        tuple[str, ...],
-        Meta(
-            max_length=1000,
-            description="addresses and networks that UDP datagrams are taken from, as in "
-            '`["192.168.7.20", "10.0.0.0/24"]`; none takes anybody\'s',
-        ),
+        tuple[str, ...], declare("networks that UDP is taken from, as `10.0.0.0/24`; none: any", length=1000)
     ] = ()
     max_datagrams_per_s: Annotated[
         int,
-        Meta(
-            ge=100,
-            le=1_000_000,
-            description="datagrams a second that are taken of one sender (address and port), and of all strangers "
-            "together; of the vehicle four times as many. UDP only [1/s]",
+        declare(
+            "UDP datagrams a second of one sender, and of all strangers together; four times as many of the vehicle",
+            "1/s",
+            100,
+            1_000_000,
         ),
     ] = 2000
-    max_frames_per_s: Annotated[
-        int,
-        Meta(
-            ge=100,
-            le=1_000_000,
-            description="the same for the frames in them, counted before any checksum or hash is taken [1/s]",
-        ),
-    ] = 800
-    max_bytes_per_s: Annotated[int, Meta(ge=10_000, le=1_000_000_000, description="the same for their bytes [1/s]")] = (
-        200_000
-    )
+    max_frames_per_s: Annotated[int, declare("the same for frames, before any checksum", "1/s", 100, 1_000_000)] = 800
+    max_bytes_per_s: Annotated[int, declare("the same for their bytes", "1/s", 10_000, 1_000_000_000)] = 200_000
 
 
 def check_security(security: SecurityConfig) -> Iterator[ConfigProblem]:
@@ -351,75 +264,36 @@ MAX_REHEARSALS = 1000  # minutes, and some 400 MB for draws and states of two mi
 class CheckConfig(Section, frozen=True, kw_only=True):
     """`uavctl check`, and what it has to say before `uavctl fly --arm` arms (docs/check.md)."""
 
-    seconds: Annotated[
-        float, Meta(le=600, ge=0.001, description="how long positions and vehicle are listened to [s]")
-    ] = 8.0
-    wait_s: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=600,
-            description="how much longer, if the vehicle has no position of its own yet: its estimator may be starting "
-            "[s]",
-        ),
-    ] = 15.0
+    seconds: Annotated[float, declare("how long positions and vehicle are listened to", "s", 0.001, 600)] = 8.0
+    wait_s: Annotated[float, declare("longer wait for a vehicle without an own position yet", "s", 0, 600)] = 15.0
     same_origin: Annotated[
         bool,
-        Meta(
-            description="the vehicle's own position counts from the same origin as the cameras' after [frame]; `false` "
-            "if it counts from where it was switched on: then only its movements are compared"
+        declare(
+            "the vehicle's own position has the cameras' origin after [frame]; `false`: that of where it was "
+            "switched on"
         ),
     ] = True
     offset_m: Annotated[
-        float,
-        Meta(ge=0.001, le=1e6, description="largest distance between the vehicle's own position and the cameras' [m]"),
+        float, declare("largest distance between the vehicle's own position and the cameras'", "m", 0.001, 1e6)
     ] = 0.5
-    move_m: Annotated[
-        float, Meta(ge=0.001, le=1000, description="shortest movement of the body that shows axes [m]")
-    ] = 0.3
-    yaw_deg: Annotated[
-        float, Meta(le=45, ge=0.01, description="largest turn between the cameras' north and the vehicle's [deg]")
-    ] = 10.0
-    margin_m: Annotated[
-        float,
-        Meta(ge=0, le=1000, description="how far outside the limits of `sets` a vehicle may stand before a flight [m]"),
-    ] = 0.25
-    rehearsals: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=MAX_REHEARSALS,
-            description="flights that are rehearsed with disturbances and losses, for the probability that one leaves "
-            "the room; 0 rehearses none",
-        ),
-    ] = 60
-    battery_v: Annotated[
-        float, Meta(ge=0, le=1000, description="least voltage of the battery; 0 does not judge it [V]")
-    ] = 0.0
-    accept: Annotated[
-        tuple[str, ...],
-        Meta(
-            max_length=100,
-            description="names of items that may fail: they are told, and arming is not refused for them",
-        ),
-    ] = ()
+    move_m: Annotated[float, declare("shortest movement of the body that shows axes", "m", 0.001, 1000)] = 0.3
+    yaw_deg: Annotated[float, declare("largest turn of the cameras' north and the vehicle's", "deg", 0.01, 45)] = 10.0
+    margin_m: Annotated[float, declare("how far outside `sets` a flight may begin", "m", 0, 1000)] = 0.25
+    rehearsals: Annotated[int, declare("rehearsals, for the risk to leave the room", "", 0, MAX_REHEARSALS)] = 60
+    battery_v: Annotated[float, declare("least voltage of the battery; 0 does not judge it", "V", 0, 1000)] = 0.0
+    accept: Annotated[tuple[str, ...], declare("items that may fail without a refusal to arm", length=100)] = ()
 
 
 class RelayConfig(Section, frozen=True, kw_only=True):
     """External positions, passed on to the vehicle's own estimator on the vehicle's link (docs/check.md)."""
 
-    enabled: Annotated[bool, Meta(description="pass positions on")] = False
+    enabled: Annotated[bool, declare("pass positions on")] = False
     message: Annotated[
         Literal["vision-position-estimate", "odometry"],
-        Meta(description="as which MAVLink message, in local NED; PX4 and ArduPilot take both"),
+        declare("MAVLink message, in local NED; PX4 and ArduPilot take both"),
     ] = "vision-position-estimate"
     vehicle_time: Annotated[
         bool,
-        Meta(
-            description="a vehicle that asks for our time (PX4) gets that of its own clock, in which positions are "
-            "stamped; else it gets ours, and moves their stamps by the offset that it finds"
-        ),
+        declare("stamp positions by the vehicle's clock, for a vehicle that asks for our time (PX4); else by ours"),
     ] = True
-    rate_hz: Annotated[
-        float, Meta(ge=0.1, le=1000, description="at most so many a second; the newest are sent [1/s]")
-    ] = 50.0
+    rate_hz: Annotated[float, declare("at most so many a second; the newest are sent", "1/s", 0.1, 1000)] = 50.0

@@ -1,8 +1,8 @@
 """A configuration document: bounds of its size, text files, lines of its keys, base of its sections, types as text.
 
-Parsers give values without lines, or lines without key paths; a message that names the line of a wrong key needs both.
-The scanner of key lines requires valid TOML, so the parser runs first. A document that nests too deep, or whose numbers
-and texts no key takes, is refused with its line before further processing.
+`tomllib` gives values without lines. One pattern finds the lines at which tables and keys begin; rows of a list are
+counted by brackets and commas. A document that nests too deep, or whose numbers and texts no key takes, is refused with
+its line before further processing.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import os
 import re
 import stat
 import types
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -221,23 +221,18 @@ def refuse_file(path: Path, reasons: Sequence[str]) -> None:
         raise DataFileError((*reasons[:_MAX_REPORTED], *more))
 
 
-_TOKEN = re.compile(
-    r'''
-    (?P<skip>[ \t\r]+|\#[^\n]*)
-  | (?P<newline>\n)
-  | (?P<string>"""(?:[^"\\]|\\.|"(?!""))*+"{3,5}|\'\'\'.*?\'{3,5}|"(?:\\.|[^"\\\n])*+"|'[^'\n]*')
-  | (?P<mark>[\[\]{}=,.])
-  | (?P<word>[^\s\[\]{}=,.\#"']+)
-    ''',
-    re.VERBOSE | re.DOTALL,
-)
+_PART = r"""(?:[A-Za-z0-9_-]+|"(?:\\.|[^"\\\n])*+"|'[^'\n]*')"""
+# The begin of `[table]`, of `[[table]]`, which is one more element of a list, or of `key = value`.
+_STATEMENT = re.compile(rf"[ \t]*(?P<brackets>\[\[?)?[ \t]*(?P<key>{_PART}(?:[ \t]*\.[ \t]*{_PART})*)[ \t]*[=\]]")
 
 
 def find_key_lines(text: str) -> dict[str, int]:
-    """Line (from 1) of every table, key and list element, named as `plant.a`, `plant.a[0][1]`, `fence[0].side`."""
-    scanner = _Scanner(text)
-    scanner.scan()
-    return scanner.lines
+    """Line (from 1) of every table, key and row of a list, named as `plant.a`, `plant.a[0]`, `fence[0].side`."""
+    lines: dict[str, int] = {}
+    for name, line, _ in _iterate_keys(text):
+        for enclosing in _iterate_enclosing(name):
+            lines.setdefault(enclosing, line)
+    return lines
 
 
 def find_repeated_key(text: str) -> tuple[str, int, int] | None:
@@ -245,120 +240,45 @@ def find_repeated_key(text: str) -> tuple[str, int, int] | None:
 
     The text may break off after it.
     """
-    scanner = _Scanner(text)
-    with suppress(IndexError):  # it breaks off
-        scanner.scan()
-    return scanner.repeated[0] if scanner.repeated else None
+    lines: dict[str, int] = {}
+    repeated = None
+    for name, line, is_row in _iterate_keys(text):
+        if not is_row:
+            known = next((enclosing for enclosing in _iterate_enclosing(name) if enclosing in lines), None)
+            repeated = None if known is None else (known, lines[known], line)
+            for enclosing in _iterate_enclosing(name):
+                lines.setdefault(enclosing, line)
+    return repeated
 
 
-class _Scanner:
-    """Recursive descent over the tokens; only structure is read, values are passed over."""
-
-    def __init__(self, text: str) -> None:
-        self.lines: dict[str, int] = {}
-        self.repeated: list[
-            tuple[str, int, int]
-        ] = []  # keys of the last statement that were there: key, first line, line
-        self._values: set[str] = set()  # keys that have a value
-        self._known: set[str] = set()
-        self._count: dict[str, int] = {}  # elements so far of each array of tables, less one
-        self._tokens: list[tuple[str, int]] = []  # token, line; a newline is "\n"
-        self._index = 0
-        line = 1
-        for match in _TOKEN.finditer(text):
-            if match.lastgroup != "skip":
-                self._tokens.append((match.group(), line))
-            line += match.group().count("\n")
-
-    def scan(self) -> None:
-        """Read tables and pairs up to the end."""
-        table = ""
-        while self._index < len(self._tokens):
-            if self._peek() == "\n":
-                self._index += 1
-                continue
-            self.repeated = []
-            if self._peek() == "[":
-                table = self._read_header()
+def _iterate_keys(text: str) -> Iterator[tuple[str, int, bool]]:
+    """Yield name and line of each table, key and row of a list in order, and whether it is a row."""
+    table = key = ""
+    indices: list[int] = []  # of the values in the brackets that are open
+    element_counts: Counter[str] = Counter()  # of each list of tables
+    line = 0
+    for match in _MARK.finditer("\n" + text):
+        mark = match.group()
+        line += mark.count("\n")
+        if match.lastgroup == "open":
+            if indices and key:
+                yield key + "".join(f"[{index}]" for index in indices), line, True
+            indices.append(0)
+        elif match.lastgroup == "close" and indices:
+            indices.pop()
+        elif mark == "," and indices:
+            indices[-1] += 1
+        elif mark == "\n" and not indices and (statement := _STATEMENT.match(text, match.end() - 1)):
+            # A longer name is refused; kept whole for each of its keys, it would fill the memory.
+            name = ".".join(part.strip("\"'") for part in re.findall(_PART, statement["key"]))[:_MAX_PATH_LENGTH]
+            if statement["brackets"] is None:
+                key = f"{table}.{name}"[:_MAX_PATH_LENGTH] if table else name
             else:
-                self._read_pair(table)
-
-    def _peek(self) -> str:
-        return self._tokens[self._index][0] if self._index < len(self._tokens) else ""
-
-    def _skip(self, mark: str) -> None:
-        while self._peek() == mark:
-            self._index += 1
-
-    def _read_header(self) -> str:
-        """Read `[table]`, or `[[table]]`, which is one more element of a list."""
-        start = self._index
-        self._skip("[")
-        is_list = self._index - start > 1
-        line = self._tokens[self._index][1]
-        path = self._read_key("")
-        self._skip("]")
-        if is_list:
-            self._count[path] = self._count.get(path, -1) + 1
-            path = f"{path}[{self._count[path]}]"
-            self.lines[path] = line
-        return path
-
-    def _read_key(self, prefix: str) -> str:
-        """Read a dotted key; each of its parts is recorded where it first stands."""
-        path = prefix
-        while True:
-            token, line = self._tokens[self._index]
-            part = token[1:-1] if token[0] in "\"'" else token
-            # A longer path is refused; kept whole for each of its keys, it would fill the memory.
-            path = (f"{path}.{part}" if path else part)[:_MAX_PATH_LENGTH]
-            first_line = self.lines.setdefault(path, line)
-            is_known = path in self._known
-            self._known.add(path)
-            self._index += 1
-            is_last = self._peek() != "."
-            if is_known and (is_last or path in self._values):
-                self.repeated.append((path, first_line, line))
-            if is_last:
-                return path
-            self._index += 1
-
-    def _read_pair(self, prefix: str) -> None:
-        path = self._read_key(prefix)
-        self._skip("=")
-        self._read_value(path)
-        self._values.add(path)
-
-    def _read_value(self, path: str) -> None:
-        if self._peek() == "[":
-            self._read_array(path)
-        elif self._peek() == "{":
-            self._read_inline_table(path)
-        else:
-            while self._peek() not in ("", "\n", ",", "]", "}"):
-                self._index += 1
-
-    def _read_array(self, path: str) -> None:
-        self._index += 1
-        element = 0
-        while self._peek() not in ("", "]"):
-            if self._peek() in ("\n", ","):
-                self._index += 1
-                continue
-            name = f"{path}[{element}]"
-            self.lines[name] = self._tokens[self._index][1]
-            self._read_value(name)
-            element += 1
-        self._index += 1
-
-    def _read_inline_table(self, path: str) -> None:
-        self._index += 1
-        while self._peek() not in ("", "}"):
-            if self._peek() in ("\n", ","):
-                self._index += 1
-            else:
-                self._read_pair(path)
-        self._index += 1
+                table, key = name, ""
+            if statement["brackets"] == "[[":
+                table = f"{name}[{element_counts[name]}]"
+                element_counts[name] += 1
+            yield key or table, line, False
 
 
 # Every number has a range and every list and text a maximum length: a value beyond is a slip, and would only show as
@@ -380,6 +300,26 @@ Position = tuple[Number, Number, Number]
 Speed = Annotated[float, Meta(ge=-100, le=100)]
 Wind = tuple[Speed, Speed, Speed]
 Spans = tuple[tuple[Number, Number], ...]
+
+
+def declare(
+    meaning: str,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    above: float | None = None,
+    below: float | None = None,
+    length: int | tuple[int, int] | None = None,
+    pattern: str | None = None,
+) -> Meta:
+    """Declare a key of a section: its meaning, unit and range; of a list or text the largest length, or both bounds."""
+    shortest, longest = length if isinstance(length, tuple) else (None, length)
+    bounds = {"ge": low, "le": high, "gt": above, "lt": below, "min_length": shortest, "max_length": longest}
+    given: dict[str, Any] = {name: bound for name, bound in bounds.items() if bound is not None}
+    if pattern is not None:
+        given["pattern"] = pattern
+    return Meta(description=f"{meaning} [{unit}]" if unit else meaning, **given)
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -20,6 +20,7 @@ from uavctl.config.document import (
     Section,
     Spans,
     UnboundedFloats,
+    declare,
     read_row_lines,
     refuse_file,
 )
@@ -37,105 +38,68 @@ class LinkConfig(Section, frozen=True, kw_only=True):
 
     loss: Annotated[
         float,
-        Meta(
-            ge=0,
-            lt=1,
-            description="probability that a packet is lost; p(k) of the design is the probability that at least one of "
-            "the positions of a Δt comes in time (source.rate_hz): 1 − lossⁿ with model `bernoulli`",
+        declare(
+            "probability that a packet is lost; the design counts on 1 − lossⁿ for the n positions of a Δt "
+            "(source.rate_hz)",
+            low=0,
+            below=1,
         ),
     ] = 0.0
     model: Annotated[
         Literal["bernoulli", "gilbert-elliott", "empirical", "trace"],
-        Meta(
-            description="how packets are lost, in the design and in the simulator. `bernoulli`: each by itself, with "
-            "`loss`, or with `probability` where that is given; `gilbert-elliott`: in bursts, by a channel that is "
-            "good (`loss`) or bad (`burst_loss`); `empirical`: in runs as measured (`gaps`); `trace`: one after the "
-            "other as measured (`trace_file`), and late as measured too"
+        declare(
+            "how packets are lost. `bernoulli`: each by itself; `gilbert-elliott`: in bursts, by a channel "
+            "that is good (`loss`) or bad (`burst_loss`); `empirical`: in runs as measured (`gaps`); `trace`: "
+            "lost and late as measured (`trace_file`)"
         ),
     ] = "bernoulli"
     probability: Annotated[
         tuple[Probability, ...],
-        Meta(
-            max_length=10_000,
-            description="with `bernoulli`: known ahead, in place of `loss`: probability that a packet of step k "
-            "arrives, k = 0, 1, …, the last one repeated; step k's packets are those of the Δt that ends at k Δt. The "
-            "design, which is one for the whole flight, counts for t steps ahead on the least of those from t on",
+        declare(
+            "with `bernoulli`, in place of `loss`: probability that a packet of step k arrives, k = 0, 1, …, "
+            "the last one repeated; the design counts on the least of the steps ahead",
+            length=10_000,
         ),
     ] = ()
     gaps: Annotated[
         tuple[Probability, ...],
-        Meta(
-            max_length=MAX_LOSS_RUN + 1,
-            description="with `empirical`: probability that exactly i packets in a row are lost after one that "
-            "arrived, i = 0, 1, …; they add up to 1",
+        declare(
+            "with `empirical`: probability of i lost packets in a row, i = 0, 1, …; they add up to 1",
+            length=MAX_LOSS_RUN + 1,
         ),
     ] = ()
     trace_file: Annotated[
         str,
-        Meta(
-            max_length=MAX_PATH_LENGTH,
-            description="with `trace`: CSV file beside this one (given on the command line: in the folder there) with "
-            "one line for each packet in the order of sending: its delay in s, nothing or `inf` for a lost one; of "
-            "several columns, the one headed `delay_s` (or `delay_ms`, `delay_us`, `delay_ns`)",
+        declare(
+            "with `trace`: CSV file beside this one with a line for each packet: its delay in s, nothing or "
+            "`inf` if lost; of several columns the one headed `delay_s` (or `_ms`, `_us`, `_ns`)",
+            length=MAX_PATH_LENGTH,
         ),
     ] = ""
     trace_s: Annotated[
         UnboundedFloats,
-        Meta(
-            max_length=MAX_TRACE_PACKETS,
-            description="with `trace`: the same delays as a list [s]; after the last packet the first one's follows. "
-            "The design takes a position that is on its way for longer than delay_s + jitter_s for lost, and the runs "
-            "of losses as they come in the trace; a campaign begins each run at another packet",
+        declare(
+            "with `trace`: these delays as a list, repeated after its end; longer ones than delay_s + jitter_s "
+            "are lost to the design",
+            "s",
+            length=MAX_TRACE_PACKETS,
         ),
     ] = ()
-    burst_enter: Annotated[
-        float,
-        Meta(ge=0, le=1, description="with `gilbert-elliott`: probability of entering the bad state, each packet"),
-    ] = 0.0
-    burst_leave: Annotated[
-        float, Meta(gt=0, le=1, description="with `gilbert-elliott`: probability of leaving the bad state, each packet")
-    ] = 1.0
-    burst_loss: Annotated[
-        float,
-        Meta(ge=0, le=1, description="with `gilbert-elliott`: loss in the bad state (`loss` applies in the good one)"),
-    ] = 1.0
-    delay_s: Annotated[
-        float, Meta(ge=0, le=MAX_DELAY_S, description="constant delay of a packet, but with `trace` [s]")
-    ] = 0.0
-    jitter_s: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=MAX_DELAY_S,
-            description="uniform extra delay from 0 to this, likewise [s]; packets may overtake others",
-        ),
-    ] = 0.0
-    duplicate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet comes twice")] = 0.0
-    corrupt: Annotated[float, Meta(ge=0, le=1, description="probability that one bit of a packet is flipped")] = 0.0
-    truncate: Annotated[float, Meta(ge=0, le=1, description="probability that a packet is cut short")] = 0.0
-    oversize: Annotated[
-        float, Meta(ge=0, le=1, description="probability that a packet comes as a datagram of more than 4096 bytes")
-    ] = 0.0
+    burst_enter: Annotated[float, declare("`gilbert-elliott`: probability of entering the bad state", "", 0, 1)] = 0.0
+    burst_leave: Annotated[float, declare("`gilbert-elliott`: probability of leaving it", high=1, above=0)] = 1.0
+    burst_loss: Annotated[float, declare("`gilbert-elliott`: loss in it", "", 0, 1)] = 1.0
+    delay_s: Annotated[float, declare("constant delay of a packet, but with `trace`", "s", 0, MAX_DELAY_S)] = 0.0
+    jitter_s: Annotated[float, declare("uniform extra delay; packets may overtake", "s", 0, MAX_DELAY_S)] = 0.0
+    duplicate: Annotated[float, declare("probability that a packet comes twice", "", 0, 1)] = 0.0
+    corrupt: Annotated[float, declare("probability that one bit of a packet is flipped", "", 0, 1)] = 0.0
+    truncate: Annotated[float, declare("probability that a packet is cut short", "", 0, 1)] = 0.0
+    oversize: Annotated[float, declare("probability of a datagram of over 4096 bytes", "", 0, 1)] = 0.0
     blackout: Annotated[
-        Spans,
-        Meta(
-            max_length=MAX_SPANS, description="spans [from_s, to_s] since the start in which every packet is lost [s]"
-        ),
+        Spans, declare("spans [from_s, to_s] in which all packets are lost", "s", length=MAX_SPANS)
     ] = ()
-    held: Annotated[
-        Spans,
-        Meta(
-            max_length=MAX_SPANS,
-            description="spans [from_s, to_s] since the start in which nothing arrives; what was to arrive comes at "
-            "the end, all at once and in the order of arrival [s]",
-        ),
-    ] = ()
+    held: Annotated[Spans, declare("spans [from_s, to_s] that hold packets to their end", "s", length=MAX_SPANS)] = ()
     uplink_blackout: Annotated[
-        Spans,
-        Meta(
-            max_length=MAX_SPANS,
-            description="spans [from_s, to_s] since the start in which nothing that we send reaches the vehicle [s]",
-        ),
+        Spans, declare("spans [from_s, to_s] in which nothing reaches the vehicle", "s", length=MAX_SPANS)
     ] = ()
 
 

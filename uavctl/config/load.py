@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 import numpy as np
-from msgspec import NODEFAULT, Meta
+from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo
 
 from uavctl.config.checks import check_sections
@@ -30,6 +30,7 @@ from uavctl.config.document import (
     DataFileError,
     Section,
     Source,
+    declare,
     describe_type,
     find_excess,
     find_key_lines,
@@ -145,7 +146,10 @@ _MAY_BE_INFINITE = ("sets.", "link.trace_s")  # an open side, a lost packet; eve
 _MAX_VALUE_LENGTH = 40
 _UNKNOWN = "unknown key"
 # Keys of before that have no meaning any more, and why; values of before, with why and what to write instead.
-_REMOVED = {"solver.exact": "it had a meaning with the policy library only, which is gone"}
+_REMOVED = {
+    "solver.exact": "it had a meaning with the policy library only, which is gone",
+    "log.stop_bytes": "a recording goes on until the disk is full",
+}
 _REMOVED_VALUES = {("solver.method", "library"): ("the policy library is gone", 'remove the key, or write "exact"')}
 _MAX_NAMED = 3  # keys that a wrong one may have meant
 _MAX_UNKNOWN = 10  # unknown keys reported one by one
@@ -291,6 +295,8 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
     missing = [
         f"{section}.{key}={value}" for (section, key), value in old_values.items() if key not in table.get(section, {})
     ]
+    if isinstance(log := table.get("log"), dict):
+        log.pop("stop_bytes", None)
     solver = table.get("solver")
     if isinstance(solver, dict):  # of the policy library
         solver.pop("exact", None)
@@ -602,9 +608,7 @@ def read_document(section: type[D], path: Path) -> tuple[D | None, Source, list[
 
 
 FaultCheck = Callable[[Literal["px4", "ardupilot"], Sequence[FaultConfig], str], Iterable[ConfigProblem]]
-_Faults = Annotated[
-    tuple[FaultConfig, ...], Meta(max_length=MAX_FAULTS, description="what happens in the course of a flight")
-]
+_Faults = Annotated[tuple[FaultConfig, ...], declare("what happens in the course of a flight", length=MAX_FAULTS)]
 
 
 class _FaultFile(Section, frozen=True, kw_only=True):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
-from uavctl.config.columns import TRAJECTORY_UNITS, StatedColumn, parse_heading, read_header
 from uavctl.config.document import (
     MAX_NUMBER,
     MAX_PATH_LENGTH,
@@ -23,6 +22,7 @@ from uavctl.config.document import (
     Number,
     Position,
     Section,
+    declare,
     read_row_lines,
     refuse_file,
 )
@@ -32,74 +32,46 @@ class TrajectoryConfig(Section, frozen=True, kw_only=True):
     """A trajectory as samples; time counts from the first decision with a vehicle that takes setpoints."""
 
     times_s: Annotated[
-        Floats,
-        Meta(max_length=MAX_TRAJECTORY_SAMPLES, description="times of the samples, increasing from 0 or later [s]"),
+        Floats, declare("times of the samples, increasing from 0", "s", length=MAX_TRAJECTORY_SAMPLES)
     ] = ()
     positions_m: Annotated[
-        tuple[Position, ...],
-        Meta(max_length=MAX_TRAJECTORY_SAMPLES, description="positions at these times, local NED [m]"),
+        tuple[Position, ...], declare("positions at these times, local NED", "m", length=MAX_TRAJECTORY_SAMPLES)
     ] = ()
     velocities_mps: Annotated[
         tuple[Position, ...],
-        Meta(
-            max_length=MAX_TRAJECTORY_SAMPLES,
-            description="velocities at these times, local NED [m/s]; without them they follow from the positions",
+        declare(
+            "velocities at these times, local NED; default: by the positions", "m/s", length=MAX_TRAJECTORY_SAMPLES
         ),
     ] = ()
     file: Annotated[
         str,
-        Meta(
-            max_length=MAX_PATH_LENGTH,
-            description="CSV file with the samples instead, beside this file: columns t, x, y, z in s and m, and "
-            "vx, vy, vz in m/s or none of them, in local NED; with a header line in the order that it states, by names "
-            "and units as in `time_ms`, `east_m`, `height [cm]`, `v_north_mps`",
+        declare(
+            "CSV file with the samples, beside this one: t, x, y, z and perhaps vx, vy, vz in s, m and m/s, "
+            "local NED; a header may state others, as in `time_ms`, `east_m`, `height [cm]`",
+            length=MAX_PATH_LENGTH,
         ),
     ] = ""
-    interpolation: Annotated[
-        Literal["cubic", "linear"], Meta(description="between the samples: `cubic` spline, or `linear`")
-    ] = "cubic"
+    interpolation: Annotated[Literal["cubic", "linear"], declare("`cubic` spline, or `linear`")] = "cubic"
 
 
 class MissionConfig(Section, frozen=True, kw_only=True):
     """Waypoints, or a trajectory; with neither, `target.position_m` is held from start to end."""
 
-    waypoints: Annotated[
-        tuple[Position, ...],
-        Meta(max_length=1000, description="positions to fly to, one after the other, local NED [m]"),
-    ] = ()
+    waypoints: Annotated[tuple[Position, ...], declare("positions to fly to, local NED", "m", length=1000)] = ()
     hold_s: Annotated[
-        Number | Annotated[Floats, Meta(max_length=1000)],
-        Meta(description="time at each waypoint, from the arrival on: one number, or one for each of them [s]"),
+        Number | Annotated[Floats, Meta(max_length=1000)], declare("time at each waypoint: one number, or a list", "s")
     ] = 0.0
-    accept_m: Annotated[
-        float, Meta(ge=0.001, le=1e6, description="a waypoint is reached when the estimate is this near to it [m]")
-    ] = 0.3
+    accept_m: Annotated[float, declare("distance at which a waypoint is reached", "m", 0.001, 1e6)] = 0.3
     then: Annotated[
         Literal["hold", "land"],
-        Meta(
-            description="after the last waypoint's time, or the trajectory's end: `hold` that place, or `land`: brake "
-            "and hand over to the vehicle's own landing"
-        ),
+        declare("at the end: `hold` the place, or `land`: brake and hand over to the vehicle's own landing"),
     ] = "hold"
     yaw: Annotated[
         Literal["hold", "path", "angle"],
-        Meta(
-            description="yaw setpoint: `hold` sends none (PX4 keeps its yaw, ArduPilot does as WP_YAW_BEHAVIOR says), "
-            "`path` follows the planned motion from 0.3 m/s on, `angle` turns to `yaw_deg`"
-        ),
+        declare("`hold`: no yaw setpoint; `path`: along the planned motion from 0.3 m/s on; `angle`: `yaw_deg`"),
     ] = "hold"
-    yaw_deg: Annotated[
-        Annotated[float, Meta(ge=-180, le=180)] | None,
-        Meta(description="yaw of `angle`, clockwise from north as seen from above [deg]"),
-    ] = None
-    yaw_rate_dps: Annotated[
-        float,
-        Meta(
-            ge=1,
-            le=360,
-            description="largest turn of the yaw setpoint in a second; ArduPilot's own limit is 60 [deg/s]",
-        ),
-    ] = 60.0
+    yaw_deg: Annotated[Annotated[float, Meta(ge=-180, le=180)] | None, declare("clockwise from north", "deg")] = None
+    yaw_rate_dps: Annotated[float, declare("fastest turn of yaw; ArduPilot's own limit is 60", "deg/s", 1, 360)] = 60.0
     trajectory: TrajectoryConfig = TrajectoryConfig()
 
 
@@ -108,21 +80,11 @@ class FenceConfig(Section, frozen=True, kw_only=True):
 
     state: Annotated[
         Annotated[str, Meta(max_length=100)] | Annotated[int, Meta(ge=0, lt=MAX_STATES)],
-        Meta(description="axis whose position is limited (`north`, `east`, `down`), or index of a state"),
+        declare("axis whose position is limited, or index of a state"),
     ]
-    side: Annotated[Literal["lower", "upper"], Meta(description="which limit")]
-    times_s: Annotated[
-        Floats,
-        Meta(min_length=1, max_length=1000, description="times, increasing; counted as those of the mission [s]"),
-    ]
-    values: Annotated[
-        Floats,
-        Meta(
-            min_length=1,
-            max_length=1000,
-            description="limit at these times, a line in between, constant before and after [m, m/s, m/s²]",
-        ),
-    ]
+    side: Annotated[Literal["lower", "upper"], declare("which limit")]
+    times_s: Annotated[Floats, declare("times, increasing; counted as those of the mission", "s", length=(1, 1000))]
+    values: Annotated[Floats, declare("limits at these times, linear in between", "m, m/s, m/s²", length=(1, 1000))]
 
 
 _FORMAT_HINT = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
@@ -167,6 +129,59 @@ def read_trajectory_file(
         places[f"mission.trajectory.{name}"] = str(path)
         places |= {f"mission.trajectory.{name}[{i}]": f"{path}:{line}" for i, (line, _) in enumerate(rows)}
     return msgspec.structs.replace(mission, trajectory=samples), places
+
+
+# Quantity and sign of the words in a header, and the factors of units.
+_QUANTITIES = {
+    **dict.fromkeys(("t", "time", "stamp", "timestamp"), ("t", 1.0)),
+    **dict.fromkeys(("x", "north", "n"), ("x", 1.0)),
+    **dict.fromkeys(("y", "east", "e"), ("y", 1.0)),
+    **dict.fromkeys(("z", "down", "d"), ("z", 1.0)),
+    **dict.fromkeys(("height", "up", "altitude", "alt", "h"), ("z", -1.0)),
+}
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+_METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "km": 1000.0}
+_SPEEDS = {unit + form: factor for unit, factor in _METRES.items() for form in ("ps", "/s")} | {"km/h": 1.0 / 3.6}
+_UNITS = {"t": _SECONDS, **dict.fromkeys(("x", "y", "z"), _METRES), **dict.fromkeys(("vx", "vy", "vz"), _SPEEDS)}
+# A word for position or velocity, a quantity, and a unit after `_` or in brackets: `pos_x`, `v_north [cm/s]`.
+_HEADING = re.compile(
+    rf"(?:p|pos|position|(?P<velocity>v|vel|velocity|speed))?[_\s.\-]*+(?P<quantity>{'|'.join(_QUANTITIES)})"
+    r"(?:(?:[_\s]++|(?=[\[(]))[\[(]?(?P<unit>[^\])]*)[\])]?)?"
+)
+
+
+class StatedColumn(NamedTuple):
+    """Place of a quantity in the rows, and what a number there is multiplied by."""
+
+    column: int
+    factor: float
+
+
+def parse_heading(cell: str) -> tuple[str, float, str] | None:
+    """What a heading names: `t`, `x`, `vx` …, its sign, and its unit (empty where it states none); None if nothing."""
+    match = _HEADING.fullmatch(cell.strip(" \"'").lower())
+    if match is None:
+        return None
+    name, sign = _QUANTITIES[match["quantity"]]
+    return ("v" if match["velocity"] else "") + name, sign, (match["unit"] or "").strip()
+
+
+def read_header(cells: Sequence[str]) -> tuple[dict[str, StatedColumn], list[str]]:
+    """The columns of a header by quantity, and what is wrong with it."""
+    columns: dict[str, StatedColumn] = {}
+    problems: list[str] = []
+    for index, cell in enumerate(cells):
+        label = f'column {index + 1}, "{cell.strip()[:_MAX_SHOWN]}"'
+        name, sign, unit = parse_heading(cell) or ("", 1.0, "")
+        if name not in _UNITS:
+            problems.append(f"{label}, is not a quantity that is known here; rename or remove the column")
+        elif unit and unit not in _UNITS[name]:
+            problems.append(f'{label}: "{unit}" is not a unit of it; give one of {", ".join(_UNITS[name])}')
+        elif name in columns:
+            problems.append(f"{label}, means the same as column {columns[name].column + 1}; keep one of them")
+        else:
+            columns[name] = StatedColumn(index, sign * (_UNITS[name][unit] if unit else 1.0))
+    return columns, problems
 
 
 # A cell of a header, without separators outside of brackets. A bracket without its end goes on to the end of the line:
@@ -221,11 +236,8 @@ def _read_columns(
     if not rows or any(_parse_number(cell) is not None for cell in rows[0][1]):
         return [], rows
     (line, cells), rows = rows[0], rows[1:]
-    units = None
-    if rows and not any(_parse_number(cell) is not None for cell in rows[0][1]):
-        units, rows = rows[0][1], rows[1:]
-    columns, problems = read_header(cells, units, TRAJECTORY_UNITS)
-    names = list(TRAJECTORY_UNITS)
+    columns, problems = read_header(cells)
+    names = list(_UNITS)
     required = names if any(name in columns for name in names[_POSITION_COLUMNS:]) else names[:_POSITION_COLUMNS]
     if not problems and (missing := [name for name in required if name not in columns]):
         problems.append(f"the header has no column for {', '.join(missing)}; {_FORMAT_HINT}")

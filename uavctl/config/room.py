@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from uavctl.config.defaults import AXES, find_position_states
-from uavctl.config.document import ConfigProblem, Number, Section
+from uavctl.config.document import ConfigProblem, Number, Section, declare
 
 Span = tuple[Number, Number] | None
 Size = Annotated[float, Meta(gt=0, le=1000)] | None
@@ -23,15 +23,15 @@ ROOM_KEYS = ("sets", "target.position_m", "limits.accel_mps2")
 class RoomConfig(Section, frozen=True, kw_only=True):
     """Limits of the vehicle's centre and its target by name, in place of `[sets]`, `[target]` and their lists."""
 
-    north_m: Annotated[Span, Meta(description="least and largest position north [m]")] = None
-    east_m: Annotated[Span, Meta(description="least and largest position east [m]")] = None
-    height_m: Annotated[Span, Meta(description="least and largest height above the origin, up is positive [m]")] = None
-    speed_mps: Annotated[Size, Meta(description="largest speed north, and east [m/s]")] = None
-    climb_mps: Annotated[Size, Meta(description="largest speed up and down [m/s]")] = None
-    accel_mps2: Annotated[Size, Meta(description="largest acceleration setpoint north, and east [m/s²]")] = None
-    target_north_m: Annotated[Number | None, Meta(description="target [m]; without it where the base has it")] = None
-    target_east_m: Annotated[Number | None, Meta(description="target [m]; without it where the base has it")] = None
-    target_height_m: Annotated[Number | None, Meta(description="target [m]; without it where the base has it")] = None
+    north_m: Annotated[Span, declare("least and largest position north", "m")] = None
+    east_m: Annotated[Span, declare("least and largest position east", "m")] = None
+    height_m: Annotated[Span, declare("least and largest height above the origin, up is positive", "m")] = None
+    speed_mps: Annotated[Size, declare("largest speed north, and east", "m/s")] = None
+    climb_mps: Annotated[Size, declare("largest speed up and down", "m/s")] = None
+    accel_mps2: Annotated[Size, declare("largest acceleration setpoint north, and east", "m/s²")] = None
+    target_north_m: Annotated[Number | None, declare("target [m]; without it where the base has it")] = None
+    target_east_m: Annotated[Number | None, declare("target [m]; without it where the base has it")] = None
+    target_height_m: Annotated[Number | None, declare("target [m]; without it where the base has it")] = None
 
 
 _AXIS_KEYS = {

@@ -9,7 +9,17 @@ import msgspec
 from msgspec import Meta
 
 from uavctl.config.connections import DaemonConfig
-from uavctl.config.document import MAX_DURATION_S, MAX_SEED, MAX_SPANS, ConfigProblem, Position, Section, Spans, Wind
+from uavctl.config.document import (
+    MAX_DURATION_S,
+    MAX_SEED,
+    MAX_SPANS,
+    ConfigProblem,
+    Position,
+    Section,
+    Spans,
+    Wind,
+    declare,
+)
 
 MAX_FAULTS = 1000
 
@@ -17,106 +27,50 @@ MAX_FAULTS = 1000
 class CameraConfig(Section, frozen=True, kw_only=True):
     """Simulated motion capture."""
 
-    rate_hz: Annotated[float, Meta(ge=0.01, le=1000, description="samples a second [1/s]")]
-    phase_s: Annotated[
-        float, Meta(ge=0, le=MAX_DURATION_S, description="time of the first sample; then every 1/rate_hz [s]")
-    ] = 0.0
-    noise_std_m: Annotated[float, Meta(ge=0, le=1000, description="noise of a position, each axis [m]")] = 0.0
-    latency_s: Annotated[
-        float, Meta(ge=0, le=60, description="processing time in the cameras, before the link [s]")
-    ] = 0.0
-    jitter_s: Annotated[
-        float,
-        Meta(
-            ge=0, le=60, description="uniform extra processing time from 0 to this [s]; samples may overtake each other"
-        ),
-    ] = 0.0
-    clock_offset_s: Annotated[float, Meta(ge=-3999, le=1e9, description="offset of the cameras' clock [s]")] = 0.0
-    clock_drift_ppm: Annotated[
-        float, Meta(ge=-1e5, le=1e5, description="what the cameras' clock gains [millionths]; recorded: 1e4 to 3e4")
-    ] = 0.0
-    occluded: Annotated[
-        Spans,
-        Meta(
-            max_length=MAX_SPANS,
-            description="spans [from_s, to_s] since the start in which the vehicle is not seen: no samples [s]",
-        ),
-    ] = ()
-    occlusions_per_s: Annotated[
-        float,
-        Meta(
-            ge=0, le=100, description="random occlusions beside those: how many a second begin while it is seen [1/s]"
-        ),
-    ] = 0.0
-    occlusion_s: Annotated[
-        float, Meta(ge=0.001, le=MAX_DURATION_S, description="their mean length; lengths are exponential [s]")
-    ] = 0.5
+    rate_hz: Annotated[float, declare("samples a second", "1/s", 0.01, 1000)]
+    phase_s: Annotated[float, declare("time of the first sample; then every 1/rate_hz", "s", 0, MAX_DURATION_S)] = 0.0
+    noise_std_m: Annotated[float, declare("noise of a position, each axis", "m", 0, 1000)] = 0.0
+    latency_s: Annotated[float, declare("processing time in the cameras, before the link", "s", 0, 60)] = 0.0
+    jitter_s: Annotated[float, declare("uniform extra processing time; samples may overtake", "s", 0, 60)] = 0.0
+    clock_offset_s: Annotated[float, declare("offset of the cameras' clock", "s", -3999, 1e9)] = 0.0
+    clock_drift_ppm: Annotated[float, declare("gain of the cameras' clock; seen: 1e4 to 3e4", "ppm", -1e5, 1e5)] = 0.0
+    occluded: Annotated[Spans, declare("spans [from_s, to_s] without samples", "s", length=MAX_SPANS)] = ()
+    occlusions_per_s: Annotated[float, declare("random occlusions that begin in a second", "1/s", 0, 100)] = 0.0
+    occlusion_s: Annotated[float, declare("their mean length (exponential)", "s", 0.001, MAX_DURATION_S)] = 0.5
     swapped: Annotated[
         Spans,
-        Meta(
-            max_length=MAX_SPANS,
-            description="spans [from_s, to_s] since the start in which another body is taken for the vehicle: it "
-            "stands still at other_body_m, level, its nose north [s]",
+        declare(
+            "spans [from_s, to_s] in which a body that rests at other_body_m is taken for the vehicle",
+            "s",
+            length=MAX_SPANS,
         ),
     ] = ()
-    other_body_m: Annotated[Position, Meta(description="position of that other body, local NED [m]")] = (0.0, 0.0, 0.0)
-    frozen: Annotated[
-        Spans,
-        Meta(
-            max_length=MAX_SPANS,
-            description="spans [from_s, to_s] since the start in which the last sample's pose is repeated, to the last "
-            "bit, with new stamps [s]",
-        ),
-    ] = ()
+    other_body_m: Annotated[Position, declare("position of that other body, local NED", "m")] = (0.0, 0.0, 0.0)
+    frozen: Annotated[Spans, declare("spans [from_s, to_s] that repeat the last pose", "s", length=MAX_SPANS)] = ()
     message: Annotated[
-        Literal["vision", "vicon", "mocap", "odometry"],
-        Meta(description="MAVLink message; `odometry` carries the velocity too"),
+        Literal["vision", "vicon", "mocap", "odometry"], declare("MAVLink message; `odometry` has the velocity too")
     ] = "vision"
 
 
 class WindConfig(Section, frozen=True, kw_only=True):
     """Wind of the simulated quadrotor: steady, with Dryden gusts (docs/vehicle.md)."""
 
-    velocity_mps: Annotated[Wind, Meta(description="steady wind: velocity of the air, local NED [m/s]")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
-    gust_wind_mps: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=50,
-            description="wind speed at 20 ft that sets the strength of the gusts (light 7.7, moderate 15.4); 0 is none "
-            "[m/s]",
-        ),
-    ] = 0.0
-    height_m: Annotated[
-        float, Meta(ge=0.01, le=1000, description="height for which the gusts' scales are taken [m]")
-    ] = 2.0
+    velocity_mps: Annotated[Wind, declare("steady wind: velocity of the air, local NED", "m/s")] = (0.0, 0.0, 0.0)
+    gust_wind_mps: Annotated[float, declare("wind at 20 ft that sets the gusts (light: 7.7)", "m/s", 0, 50)] = 0.0
+    height_m: Annotated[float, declare("height for which the gusts' scales are taken", "m", 0.01, 1000)] = 2.0
 
 
 class QuadrotorConfig(Section, frozen=True, kw_only=True):
     """The simulated quadrotor (docs/vehicle.md)."""
 
-    charge: Annotated[float, Meta(gt=0, le=1, description="charge of the battery at the start")] = 1.0
+    charge: Annotated[float, declare("charge of the battery at the start", high=1, above=0)] = 1.0
 
 
 class InertialConfig(Section, frozen=True, kw_only=True):
     """Inertial measurements of the simulated autopilot, and the attitude told with them (docs/vehicle.md)."""
 
-    errors: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=10,
-            description="size of the errors of inertial measurements, and of the attitude once they are asked for, "
-            "relative to those of docs/vehicle.md; 0 is none",
-        ),
-    ] = 1.0
-    flown: Annotated[
-        bool, Meta(description="whether the quadrotor flies by the wrong attitude too: what it takes for level is not")
-    ] = False
+    errors: Annotated[float, declare("size of its errors, relative to docs/vehicle.md", "", 0, 10)] = 1.0
+    flown: Annotated[bool, declare("whether the quadrotor itself flies by the wrong attitude")] = False
 
 
 class ChecksConfig(Section, frozen=True, kw_only=True):
@@ -124,34 +78,23 @@ class ChecksConfig(Section, frozen=True, kw_only=True):
 
     flicker_s: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=MAX_DURATION_S,
-            description="mean time after which its pre-flight checks change between passing and failing, drawn each "
-            "time; 0: they stay as they are [s]",
-        ),
+        declare("mean time until pre-flight checks change between pass and fail; 0: they stay", "s", 0, MAX_DURATION_S),
     ] = 0.0
     invalid: Annotated[
         Spans,
-        Meta(
-            max_length=MAX_SPANS,
-            description="spans [from_s, to_s] since arming in which its position does not count as valid: its failsafe "
-            "acts [s]",
+        declare(
+            "spans [from_s, to_s] since arming in which its position is invalid: its failsafe acts",
+            "s",
+            length=MAX_SPANS,
         ),
     ] = ()
-    clears: Annotated[
-        bool,
-        Meta(
-            description="whether a failsafe for want of a position ends with its cause: PX4 is back in the mode of "
-            "before, and a take-off goes on"
-        ),
-    ] = False
+    clears: Annotated[bool, declare("whether a failsafe for want of a position ends with its cause, as in PX4")] = False
 
 
 class FaultConfig(Section, frozen=True, kw_only=True):
     """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
 
-    at_s: Annotated[float, Meta(ge=0, le=MAX_DURATION_S, description="when, since the start [s]")]
+    at_s: Annotated[float, declare("when, since the start", "s", 0, MAX_DURATION_S)]
     kind: Annotated[
         Literal[
             "blackout",
@@ -168,32 +111,28 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             "parameter",
             "mode",
         ],
-        Meta(
-            description="`blackout`, `held`, `uplink_blackout`: a span of these of `[link]`; `occluded`, `swapped`, "
-            "`frozen`: a span of these of `[sim.camera]`; `wind`: the steady wind of the quadrotor changes; `battery`: "
-            "that of the quadrotor has another charge; `frame`: the cameras' axes are others from then on; `noise`: "
-            "so is the noise of their positions; `drift`: their origin moves from then on; `parameter`: one of the "
-            "autopilot's has another value; `mode`: the pilot changes the autopilot's mode with the stick"
+        declare(
+            "a span of `[link]` (`blackout`, `held`, `uplink_blackout`) or `[sim.camera]` (`occluded`, "
+            "`swapped`, `frozen`); or from then on another steady `wind`, `battery` charge, camera `frame`, "
+            "position `noise`, `drift` of the cameras' origin, `parameter` of the autopilot, or `mode` by the "
+            "pilot's stick"
         ),
     ]
-    for_s: Annotated[float, Meta(ge=0, le=MAX_DURATION_S, description="length of a span [s]")] = 0.0
+    for_s: Annotated[float, declare("length of a span", "s", 0, MAX_DURATION_S)] = 0.0
     velocity_mps: Annotated[
-        Wind,
-        Meta(description="of the air, with `wind`, or of positions beside the vehicle, with `drift`, local NED [m/s]"),
+        Wind, declare("of the air (`wind`) or of the cameras' origin (`drift`), local NED", "m/s")
     ] = (0.0, 0.0, 0.0)
-    charge: Annotated[float, Meta(ge=0, le=1, description="of the battery, with `battery`")] = 0.0
+    charge: Annotated[float, declare("of the battery, with `battery`", "", 0, 1)] = 0.0
     name: Annotated[
         str,
-        Meta(
-            max_length=100,
-            description="of the parameter, or of the mode as the autopilot calls it; of the axes: `turned-90`, "
-            "`turned-180`, `turned-270`, `mirrored-north`, `mirrored-east`, `mirrored-down`, `swapped`, `enu`, "
-            "`millimetres`, `kilometres`, or `right`",
+        declare(
+            "of the parameter; of the mode, as the autopilot calls it; of the axes: `turned-90`, `turned-180`, "
+            "`turned-270`, `mirrored-north`, `mirrored-east`, `mirrored-down`, `swapped`, `enu`, "
+            "`millimetres`, `kilometres`, `right`",
+            length=100,
         ),
     ] = ""
-    value: Annotated[
-        float, Meta(ge=-1e9, le=1e9, description="of the parameter, or the noise's standard deviation [m]")
-    ] = 0.0
+    value: Annotated[float, declare("of the parameter, or the noise's standard deviation", "m", -1e9, 1e9)] = 0.0
 
 
 class SimConfig(Section, frozen=True, kw_only=True):
@@ -206,36 +145,25 @@ class SimConfig(Section, frozen=True, kw_only=True):
     checks: ChecksConfig = ChecksConfig()
     plant: Annotated[
         Literal["linear", "quadrotor"],
-        Meta(
-            description="simulated vehicle: the plant of `[plant]` without its dead time, or a quadrotor with rotors, "
-            "battery, wind and the loops of its autopilot"
-        ),
+        declare("the plant of `[plant]` without its dead time, or a quadrotor with rotors, battery and autopilot"),
     ] = "linear"
-    autopilot: Annotated[
-        Literal["px4", "ardupilot"], Meta(description="whose behaviour the simulated autopilot shows")
-    ] = "px4"
+    autopilot: Annotated[Literal["px4", "ardupilot"], declare("whose behaviour the simulated autopilot shows")] = "px4"
     streams: Annotated[
         Literal["few", "onboard"],
-        Meta(
-            description="messages that the autopilot sends unasked: `few`, or `onboard`: as many and as often as a PX4 "
-            "was recorded to on such a link, above 300 a second; an ArduPilot sends few on both"
-        ),
+        declare("messages that come unasked: `few`, or `onboard`: over 300 a second, as a PX4 sends on such a link"),
     ] = "few"
-    fault: Annotated[
-        tuple[FaultConfig, ...], Meta(max_length=MAX_FAULTS, description="what happens in the course of a flight")
-    ] = ()
-    system_id: Annotated[int, Meta(ge=1, le=250, description="MAVLink system id of the simulated vehicle")] = 1
-    seed: Annotated[int, Meta(ge=0, le=MAX_SEED, description="seed of every random draw")] = 0
-    start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
-    start_velocity_mps: Annotated[Wind, Meta(description="velocity at the start, local NED [m/s]")] = (0.0, 0.0, 0.0)
-    clock_drift_ppm: Annotated[
-        float, Meta(ge=-1e5, le=1e5, description="what the vehicle's clock gains [millionths]; recorded: -1.4e4")
-    ] = 0.0
+    fault: Annotated[tuple[FaultConfig, ...], declare("what happens in the course of a flight", length=MAX_FAULTS)] = ()
+    system_id: Annotated[int, declare("MAVLink system id of the simulated vehicle", "", 1, 250)] = 1
+    seed: Annotated[int, declare("seed of every random draw", "", 0, MAX_SEED)] = 0
+    start_position_m: Annotated[Position, declare("position at the start, local NED", "m")] = (0.0, 0.0, 0.0)
+    start_velocity_mps: Annotated[Wind, declare("velocity at the start, local NED", "m/s")] = (0.0, 0.0, 0.0)
+    clock_drift_ppm: Annotated[float, declare("gain of the vehicle's clock; seen: -1.4e4", "ppm", -1e5, 1e5)] = 0.0
     setpoint_timeout_s: Annotated[
         Annotated[float, Meta(ge=0.01, le=3600)] | None,
-        Meta(
-            description="silence after which setpoints count as gone [s], COM_OF_LOSS_T or GUID_TIMEOUT; without it "
-            "0.7 s, as a room needs it (as shipped PX4 has 1 s and ArduPilot 3 s)"
+        declare(
+            "silence after which setpoints have stopped (COM_OF_LOSS_T, GUID_TIMEOUT); default 0.7; as shipped "
+            "PX4 has 1, ArduPilot 3",
+            "s",
         ),
     ] = None
 

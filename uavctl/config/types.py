@@ -1,12 +1,10 @@
 """Typed configuration: one definition gives the decoder, the checks and the reference page.
 
-Every key has its unit and meaning in `Meta(description=...)`; `docs/configuration.md` is generated
-from them.
+Each key is declared with its type, meaning, unit, range and default; `docs/configuration.md` is generated from them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -24,13 +22,13 @@ from uavctl.config.connections import (
 from uavctl.config.document import (
     MAX_DURATION_S,
     MAX_STATES,
-    ConfigProblem,
     Floats,
     Position,
     Rows,
     Section,
     UnboundedFloats,
     Weights,
+    declare,
 )
 from uavctl.config.link import LinkConfig
 from uavctl.config.mission import FenceConfig, MissionConfig
@@ -40,40 +38,11 @@ from uavctl.config.sim import SimConfig
 class LogConfig(Section, frozen=True, kw_only=True):
     """Recording."""
 
-    chunk_bytes: Annotated[
-        int, Meta(ge=1024, le=2**20, description="largest chunk of the recording, before it is compressed [bytes]")
-    ] = 131072
-    segment_bytes: Annotated[
-        int,
-        Meta(ge=100_000, le=10**12, description="after about so much the recording goes on in another file [bytes]"),
-    ] = 50_000_000
-    queue: Annotated[
-        int, Meta(ge=16, le=100_000, description="records that may wait for the disk; more are dropped and counted")
-    ] = 8192
-    free_bytes: Annotated[
-        int, Meta(ge=0, le=10**15, description="a flight is refused with less free space than this [bytes]")
-    ] = 50_000_000
-    low_bytes: Annotated[
-        int, Meta(ge=0, le=10**15, description="less free space than this in flight is a warning [bytes]")
-    ] = 30_000_000
-    stop_bytes: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=10**15,
-            description="recording rests with less free space than this, until there is low_bytes [bytes]",
-        ),
-    ] = 10_000_000
-
-
-def check_log(log: LogConfig) -> Iterator[ConfigProblem]:
-    """Yield the keys that do not fit together."""
-    if log.stop_bytes > log.low_bytes:
-        yield ConfigProblem(
-            "log.stop_bytes",
-            f"{log.stop_bytes} is more than log.low_bytes = {log.low_bytes}: there would be no warning",
-            "lower it",
-        )
+    chunk_bytes: Annotated[int, declare("largest chunk of a recording, uncompressed", "bytes", 1024, 2**20)] = 131072
+    segment_bytes: Annotated[int, declare("size at which the next file begins", "bytes", 100_000, 10**12)] = 50_000_000
+    queue: Annotated[int, declare("records that may wait for the disk; more are dropped", "", 16, 100_000)] = 8192
+    free_bytes: Annotated[int, declare("free space without which no flight begins", "bytes", 0, 10**15)] = 50_000_000
+    low_bytes: Annotated[int, declare("free space in flight below which it warns", "bytes", 0, 10**15)] = 30_000_000
 
 
 MAX_PLANNED_HORIZON = 40  # solving the program with planned feedback takes seconds beyond
@@ -89,100 +58,68 @@ class PlantConfig(Section, frozen=True, kw_only=True):
 
     model: Annotated[
         Literal["matrices", "drag-lag", "velocity-reference"],
-        Meta(
-            description="`matrices`: a, b, e, w as given (so it is where `a` is given); `drag-lag`: an acceleration "
-            "setpoint is flown, after a lag; `velocity-reference`: it moves a velocity and position that the vehicle's "
-            "own loops hold"
+        declare(
+            "`matrices`: a, b, e, w as given; `drag-lag`: an acceleration setpoint that acts after a lag; "
+            "`velocity-reference`: it moves a velocity and position that the vehicle's own loops hold"
         ),
     ]
-    dt_s: Annotated[float, Meta(ge=0.001, le=5, description="time step Δt [s]")]
+    dt_s: Annotated[float, declare("time step Δt", "s", 0.001, 5)]
     axes: Annotated[
         tuple[Literal["north", "east", "down"], ...],
-        Meta(
-            max_length=3,
-            description="axes of local NED that the plant moves in, in the order of its states; with model `matrices` "
-            "it may have none: then it is planned for and simulated, and flies nowhere",
+        declare(
+            "axes of local NED in the order of the states; `matrices` without axes are planned for and "
+            "simulated, and fly nowhere",
+            length=3,
         ),
     ] = ()
-    a: Annotated[Rows, Meta(max_length=MAX_STATES, description="A (n_x, n_x), with model `matrices`")] = ()
-    b: Annotated[Rows, Meta(max_length=MAX_STATES, description="B (n_x, n_u), with model `matrices`")] = ()
-    e: Annotated[Rows, Meta(max_length=MAX_STATES, description="E (n_x, n_w), with model `matrices`")] = ()
+    a: Annotated[Rows, declare("A (n_x, n_x), with model `matrices`", length=MAX_STATES)] = ()
+    b: Annotated[Rows, declare("B (n_x, n_u), with model `matrices`", length=MAX_STATES)] = ()
+    e: Annotated[Rows, declare("E (n_x, n_w), with model `matrices`", length=MAX_STATES)] = ()
     w: Annotated[
         Rows,
-        Meta(
-            max_length=MAX_STATES,
-            description="covariance W (n_w, n_w) of the disturbance, with model `matrices`; without it the identity",
+        declare(
+            "covariance W (n_w, n_w) of the disturbance, with model `matrices`; default: identity", length=MAX_STATES
         ),
     ] = ()
-    position_index: Annotated[
-        tuple[int, ...], Meta(max_length=3, description="state index of each axis' position, with model `matrices`")
-    ] = ()
-    velocity_index: Annotated[
-        tuple[int, ...], Meta(max_length=3, description="state index of each axis' velocity, with model `matrices`")
-    ] = ()
+    position_index: Annotated[tuple[int, ...], declare("state of each axis' position, with `matrices`", length=3)] = ()
+    velocity_index: Annotated[tuple[int, ...], declare("state of each axis' velocity, with `matrices`", length=3)] = ()
     accel_per_input: Annotated[
-        Floats,
-        Meta(
-            max_length=3,
-            description="acceleration setpoint per unit of input, each axis [m/s² per unit], with model `matrices`",
-        ),
+        Floats, declare("acceleration per input, with `matrices`", "m/s² per unit", length=3)
     ] = ()
-    drag_1ps: Annotated[
-        Floats, Meta(max_length=3, description="drag c of each axis [1/s], not with model `matrices`")
-    ] = ()
-    lag_s: Annotated[
-        Floats, Meta(max_length=3, description="acceleration lag T of each axis [s], not with model `matrices`")
-    ] = ()
-    gain: Annotated[
-        Floats, Meta(max_length=3, description="acceleration reached per acceleration asked for, with model `drag-lag`")
-    ] = ()
+    drag_1ps: Annotated[Floats, declare("drag c of each axis [1/s], not with model `matrices`", length=3)] = ()
+    lag_s: Annotated[Floats, declare("acceleration lag T of each axis [s], not with model `matrices`", length=3)] = ()
+    gain: Annotated[Floats, declare("acceleration reached per acceleration ordered, with `drag-lag`", length=3)] = ()
     wind_std_mps2: Annotated[
         Floats,
-        Meta(
-            max_length=3,
-            description="standard deviation of the acceleration noise, constant over Δt [m/s²], "
-            "not with model `matrices`",
+        declare(
+            "standard deviation of the acceleration noise, constant over Δt, not with `matrices`", "m/s²", length=3
         ),
     ] = ()
-    dead_time_s: Annotated[
-        float, Meta(ge=0, le=1, description="time from sending an input until it begins to act, all axes [s]")
-    ] = 0.0
+    dead_time_s: Annotated[float, declare("time from sending an input until it acts, all axes", "s", 0, 1)] = 0.0
     position_1ps: Annotated[
-        Floats,
-        Meta(
-            max_length=3,
-            description="gain of the vehicle's own position loop, each axis [1/s], with model `velocity-reference`",
-        ),
+        Floats, declare("position gain of the vehicle, with `velocity-reference`", "1/s", length=3)
     ] = ()
     velocity_1ps: Annotated[
-        Floats,
-        Meta(
-            max_length=3,
-            description="gain of the vehicle's own velocity loop, each axis [1/s], with model `velocity-reference`",
-        ),
+        Floats, declare("velocity gain of the vehicle, with `velocity-reference`", "1/s", length=3)
     ] = ()
     integral_1ps2: Annotated[
-        Floats,
-        Meta(
-            max_length=3,
-            description="integral gain of the vehicle's own velocity loop, each axis [1/s²], "
-            "with model `velocity-reference`",
-        ),
+        Floats, declare("integral gain of the vehicle, with `velocity-reference`", "1/s²", length=3)
     ] = ()
     input_std_mps2: Annotated[
         Floats,
-        Meta(
-            max_length=3,
-            description="standard deviation of what moves the vehicle's reference without having been sent, each axis, "
-            "constant over Δt [m/s²], with model `velocity-reference`",
+        declare(
+            "standard deviation of reference changes that nobody sent, constant over Δt, with `velocity-reference`",
+            "m/s²",
+            length=3,
         ),
     ] = ()
     force_drift_mps2_rts: Annotated[
         Floats,
-        Meta(
-            max_length=3,
-            description="standard deviation of what a lasting force (wind) gains in a second, each axis "
-            "[m/s² / √s], with model `velocity-reference`; there it takes the place of estimator.bias_drift",
+        declare(
+            "standard deviation that a lasting force (wind) gains in a second, with `velocity-reference`, in "
+            "place of estimator.bias_drift",
+            "m/s² / √s",
+            length=3,
         ),
     ] = ()
 
@@ -195,25 +132,17 @@ class PlantConfig(Section, frozen=True, kw_only=True):
 class SetsConfig(Section, frozen=True, kw_only=True):
     """Admissible boxes X and U; `inf` leaves a side open, any other number is 1e7 at most."""
 
-    state_lower: Annotated[
-        UnboundedFloats, Meta(max_length=MAX_STATES, description="lower limits of the states (n_x) [m, m/s, m/s²]")
-    ]
-    state_upper: Annotated[
-        UnboundedFloats, Meta(max_length=MAX_STATES, description="upper limits of the states (n_x) [m, m/s, m/s²]")
-    ]
-    input_lower: Annotated[
-        UnboundedFloats, Meta(max_length=3, description="lower limits of the inputs (n_u) [input units]")
-    ]
-    input_upper: Annotated[
-        UnboundedFloats, Meta(max_length=3, description="upper limits of the inputs (n_u) [input units]")
-    ]
+    state_lower: Annotated[UnboundedFloats, declare("lower limits of states (n_x)", "m, m/s, m/s²", length=MAX_STATES)]
+    state_upper: Annotated[UnboundedFloats, declare("upper limits of states (n_x)", "m, m/s, m/s²", length=MAX_STATES)]
+    input_lower: Annotated[UnboundedFloats, declare("lower limits of the inputs (n_u)", "input units", length=3)]
+    input_upper: Annotated[UnboundedFloats, declare("upper limits of the inputs (n_u)", "input units", length=3)]
 
 
 class CostConfig(Section, frozen=True, kw_only=True):
     """Stage cost (3), diagonal weights."""
 
-    state: Annotated[Weights, Meta(max_length=MAX_STATES, description="diagonal of Q_x (n_x)")]
-    input: Annotated[Weights, Meta(max_length=3, description="diagonal of Q_u (n_u)")]
+    state: Annotated[Weights, declare("diagonal of Q_x (n_x)", length=MAX_STATES)]
+    input: Annotated[Weights, declare("diagonal of Q_u (n_u)", length=3)]
 
 
 Scheme = Literal["hahn-stursberg", "age-conditioned"]
@@ -225,52 +154,35 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
 
     scheme: Annotated[
         Scheme,
-        Meta(
-            description="`age-conditioned`: plans without feedback, back-offs by the age of information, the "
-            "regulator's tail; `hahn-stursberg`: the paper's, with planned feedback and a terminal law"
+        declare(
+            "`age-conditioned`: back-offs by the age of information, no planned feedback; `hahn-stursberg`: "
+            "the paper's, with planned feedback and a terminal law"
         ),
     ] = "age-conditioned"
     controller: Annotated[
         str,
-        Meta(
-            max_length=200,
-            description="a controller of another package that plans in the place of the scheme: the name of its entry "
-            "point `uavctl.controllers`, or `module:Class` (docs/extending.md); the scheme's design says where the "
-            "vehicle may rest all the same; empty: the scheme plans",
+        declare(
+            "controller of another package in place of the scheme: entry point of `uavctl.controllers` or "
+            "`module:Class` (docs/extending.md); the scheme's design still says where the vehicle may rest",
+            length=200,
         ),
     ] = ""
     horizon: Annotated[
-        int,
-        Meta(
-            ge=2,
-            le=100,
-            description=f"prediction horizon H; with scheme `hahn-stursberg` at most {MAX_PLANNED_HORIZON} [steps]",
-        ),
+        int, declare(f"prediction horizon H; with `hahn-stursberg` at most {MAX_PLANNED_HORIZON}", "", 2, 100)
     ]
-    tau: Annotated[
-        Annotated[int, Meta(ge=1, le=20)] | None, Meta(description="delay τ of the terminal control law [steps]")
-    ] = None
-    delta_x: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_x of the state constraints")] = 0.95
-    delta_u: Annotated[Likelihood, Meta(description="likelihood δ_u of the input constraints")] = None
-    delta_tau: Annotated[Likelihood, Meta(description="threshold δ_τ of Assumption 4.1")] = None
-    k_tau: Annotated[Annotated[Rows, Meta(max_length=3)] | None, Meta(description="terminal gain K_τ (n_u, n_x)")] = (
-        None
-    )
-    slack_linear: Annotated[
-        float, Meta(ge=1e-6, le=1e12, description="exact penalty of a state-constraint slack, linear [cost per unit]")
-    ] = 1e5
-    slack_quadratic: Annotated[float, Meta(ge=1e-6, le=1e12, description="the same, quadratic [cost per unit²]")] = 1e3
+    tau: Annotated[Annotated[int, Meta(ge=1, le=20)] | None, declare("delay τ of the terminal law", "steps")] = None
+    delta_x: Annotated[float, declare("likelihood δ_x of the state constraints", above=0, below=1)] = 0.95
+    delta_u: Annotated[Likelihood, declare("likelihood δ_u of the input constraints")] = None
+    delta_tau: Annotated[Likelihood, declare("threshold δ_τ of Assumption 4.1")] = None
+    k_tau: Annotated[Annotated[Rows, Meta(max_length=3)] | None, declare("terminal gain K_τ (n_u, n_x)")] = None
+    slack_linear: Annotated[float, declare("linear penalty of a state's slack", "cost per unit", 1e-6, 1e12)] = 1e5
+    slack_quadratic: Annotated[float, declare("the same, quadratic", "cost per unit²", 1e-6, 1e12)] = 1e3
     offset_weight: Annotated[
         Annotated[float, Meta(ge=1e-6, le=1e12)] | None,
-        Meta(description="l1 weight T that pulls the artificial reference to the target [cost per unit]"),
+        declare("l1 weight T that pulls the artificial reference to the target", "cost per unit"),
     ] = None
     terminal_weight: Annotated[
-        float,
-        Meta(
-            ge=1e-6,
-            le=1e12,
-            description="l1 weight of a missed terminal equality, when no equilibrium is in reach [cost per unit]",
-        ),
+        float, declare("l1 weight of a missed terminal equality", "cost per unit", 1e-6, 1e12)
     ] = 1e5
 
     @property
@@ -284,32 +196,28 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
 
     rule: Annotated[
         Literal["fixed", "search", "greedy"],
-        Meta(description="`fixed`: as given; `search`: least cost over search_states; `greedy`: greedy reading of (7)"),
+        declare("`fixed`: as given; `search`: least cost over search_states; `greedy`: greedy reading of (7)"),
     ] = "fixed"
     delays: Annotated[
         Delay | Annotated[tuple[Delay, ...], Meta(max_length=60)],
-        Meta(description="d_t with rule `fixed`: one integer, or a list of H [steps]"),
+        declare("d_t with rule `fixed`: one integer, or a list of H", "steps"),
     ] = 0
-    gamma_max: Annotated[float, Meta(gt=0, lt=1, description="`search` and `greedy` keep every γ at or below this")] = (
-        0.985
-    )
-    search_states: Annotated[
-        Rows, Meta(max_length=200, description="states (n_x each) over whose mean cost `search` minimises")
-    ] = ()
+    gamma_max: Annotated[float, declare("largest γ that `search` and `greedy` take", above=0, below=1)] = 0.985
+    search_states: Annotated[Rows, declare("states over whose mean cost `search` minimises", length=200)] = ()
     joint: Annotated[
         bool,
-        Meta(
-            description="likelihoods γ by the exact probability that the feedback of all stages is usable; `false`: by "
-            "the product of the stages' own (6), as printed, which is more cautious where losses are independent"
+        declare(
+            "γ by the exact probability that the feedback of all stages is usable; `false`: by the product of "
+            "the stages' own (6), as printed"
         ),
     ] = False
     late: Annotated[
         int,
-        Meta(
-            ge=0,
-            le=8,
-            description="plan with a design made for their age on positions up to this many steps old [steps]; at "
-            "least what link.delay_s + link.jitter_s take, where they reach Δt",
+        declare(
+            "oldest positions that are planned on with a design for their age; at least link.delay_s + link.jitter_s",
+            "steps",
+            0,
+            8,
         ),
     ] = 0
 
@@ -319,29 +227,28 @@ class RiskConfig(Section, frozen=True, kw_only=True):
 
     allocation: Annotated[
         Literal["ellipsoid", "halfspace"],
-        Meta(description="`ellipsoid`: χ² of the whole vector, as printed; `halfspace`: Boole with Gaussian quantiles"),
+        declare("`ellipsoid`: χ² of the whole vector, as printed; `halfspace`: Boole with Gaussian quantiles"),
     ] = "ellipsoid"
     estimate: Annotated[
         Literal["exact", "innovations"],
-        Meta(
-            description="`exact`: plan as if a position showed the whole state, as printed; `innovations`: plan on the "
-            "estimate that positions alone give, with the covariance of its error in every back-off of a state"
+        declare(
+            "`exact`: a position shows the whole state, as printed; `innovations`: the covariance of the "
+            "estimate's error is in every back-off"
         ),
     ] = "exact"
     budgets: Annotated[
         Literal["certificate", "observed", "configured"],
-        Meta(
-            description="risk of each age of information, with scheme `age-conditioned`: `observed` begins as "
-            "`certificate`, and gives more to rare ages as far as the link shows, from the first position on, how rare "
-            "they are; `certificate` holds on any link, further away from limits; `configured` holds on a link as in "
-            "`[link]` alone"
+        declare(
+            "risk of each age, with scheme `age-conditioned`: `certificate` holds on any link; `observed` "
+            "begins with it, and gives more to ages that the link shows to be rare; `configured` holds on a "
+            "link as in `[link]`"
         ),
     ] = "observed"
     adapt: Annotated[
         bool,
-        Meta(
-            description="keep further away from limits in flight while they are left more often than allowed, and "
-            "nearer while less often, with `risk.budgets` `certificate` or `observed`"
+        declare(
+            "move away from limits while they are left too often, and back while less often; not with budgets "
+            "`configured`"
         ),
     ] = True
 
@@ -351,156 +258,109 @@ class SolverConfig(Section, frozen=True, kw_only=True):
 
     method: Annotated[
         Literal["exact", "printed"],
-        Meta(
-            description="`exact`: a frozen policy where it is proven optimal, else the reduced program in Clarabel; "
-            "`printed`: (19) through CVXPY (slow, hard constraints)"
-        ),
+        declare("`exact`: a frozen policy where proven optimal, else Clarabel; `printed`: (19) through CVXPY (slow)"),
     ] = "exact"
     max_iterations: Annotated[
-        int,
-        Meta(
-            ge=1,
-            le=500,
-            description="bound on interior-point iterations (never on time, so that a replay decides alike)",
-        ),
+        int, declare("most interior-point iterations (a time limit would not replay)", "", 1, 500)
     ] = 100
 
 
 class TargetConfig(Section, frozen=True, kw_only=True):
     """Target to fly to, unless `[mission]` says otherwise; the design's terminal set is checked there."""
 
-    position_m: Annotated[
-        Position, Meta(description="target position in local NED [m]; axes that the plant has not are ignored")
-    ]
+    position_m: Annotated[Position, declare("target in local NED [m]; axes that the plant lacks are ignored")]
 
 
 class EstimatorConfig(Section, frozen=True, kw_only=True):
     """Kalman filter."""
 
-    position_std_m: Annotated[
-        float,
-        Meta(ge=1e-9, le=100, description="least standard deviation believed of a position sample, each axis [m]"),
-    ] = 0.005
-    velocity_std_mps: Annotated[
-        float, Meta(ge=1e-9, le=100, description="standard deviation of a velocity sample, each axis [m/s]")
-    ] = 0.05
+    position_std_m: Annotated[float, declare("least standard deviation of a position sample", "m", 1e-9, 100)] = 0.005
+    velocity_std_mps: Annotated[float, declare("standard deviation of a velocity sample", "m/s", 1e-9, 100)] = 0.05
     initial_std: Annotated[
-        float,
-        Meta(
-            ge=1e-9,
-            le=1000,
-            description="standard deviation of the states that the first sample does not show [m/s, m/s²]",
-        ),
+        float, declare("standard deviation of states that no sample shows", "m/s, m/s²", 1e-9, 1000)
     ] = 0.5
-    window_s: Annotated[float, Meta(ge=0.001, le=60, description="samples later than this are dropped [s]")] = 2.0
-    max_position_m: Annotated[
-        float,
-        Meta(ge=0.001, le=1e7, description="a position further out, in any axis, is absurd and counts as lost [m]"),
-    ] = 1000.0
-    max_velocity_mps: Annotated[
-        float, Meta(ge=0.001, le=1e7, description="a speed beyond, in any axis, is absurd and counts as lost [m/s]")
-    ] = 100.0
+    window_s: Annotated[float, declare("samples later than this are dropped", "s", 0.001, 60)] = 2.0
+    max_position_m: Annotated[float, declare("a coordinate beyond counts as lost", "m", 0.001, 1e7)] = 1000.0
+    max_velocity_mps: Annotated[float, declare("a speed beyond counts as lost", "m/s", 0.001, 1e7)] = 100.0
     gate_sigma: Annotated[
         float,
-        Meta(
-            ge=0.001,
-            le=1e6,
-            description="number of standard deviations of two tests. A position further from the prediction than "
-            "these, gate_m and what inputs can have done since the newest one counts as lost. A value that repeats is "
-            "frozen once the prediction by inputs alone is further from it than these, gate_m and its resolution",
+        declare(
+            "standard deviations by which a position may miss the prediction, beside gate_m and what inputs "
+            "can have done, before it counts as lost; a value that repeats is frozen once the prediction has "
+            "moved as far",
+            "",
+            0.001,
+            1e6,
         ),
     ] = 6.0
-    gate_m: Annotated[
-        float,
-        Meta(
-            ge=0, le=1e6, description="distance that both tests of gate_sigma allow beside it: gusts, for example [m]"
-        ),
-    ] = 0.3
+    gate_m: Annotated[float, declare("distance that gate_sigma allows besides, for gusts", "m", 0, 1e6)] = 0.3
     bias_drift: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=1000,
-            description="standard deviation of what an unknown acceleration that stays (wind, uncompensated drag, an "
-            "error of the hover thrust) gains in a second, each input; the filter estimates it, and it is flown "
-            "against; 0: there is none, as printed [input units/√s]",
+        declare(
+            "standard deviation that a lasting unknown acceleration (wind, hover thrust) gains in a second; "
+            "the filter estimates it, and inputs compensate it; 0: none, as printed",
+            "input units/√s",
+            0,
+            1000,
         ),
     ] = 0.0
     bias_max: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=1000,
-            description="part of it up to which plans keep what they promise: they leave so much of each input free "
-            "to be flown against it; with bias_drift above 0 [input units]",
-        ),
+        declare("part of it that plans reserve of each input, so that their promise holds", "input units", 0, 1000),
     ] = 0.0
     bias_share: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=1,
-            description="share of each input's half range (sets.input_lower, input_upper) that may be spent against "
-            "it, bias_max at least: beyond bias_max the vehicle still comes to its target, while plans at their "
-            "limits are cut by the setpoint limiter",
+        declare(
+            "share of an input's half range that may compensate it, at least bias_max; beyond bias_max the "
+            "setpoint limiter cuts plans at their limits",
+            "",
+            0,
+            1,
         ),
     ] = 0.0
     inertial_std_mps2: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=100,
-            description="standard deviation of the acceleration that the vehicle's own inertial sensors and attitude "
-            "show in a tick, each axis; they are asked for, and move the estimate between positions; 0: they are not "
-            "used [m/s²]",
+        declare(
+            "standard deviation of the acceleration by inertial sensors and attitude in a tick; they move the "
+            "estimate between positions; 0: not used",
+            "m/s²",
+            0,
+            100,
         ),
     ] = 0.0
     inertial_bias_mps2: Annotated[
         float,
-        Meta(
-            gt=0,
-            le=100,
-            description="standard deviation of what they are off for longer: a bias, an attitude that is not level "
-            "(1° is 0.17 m/s²); the filter estimates it [m/s²]",
+        declare(
+            "standard deviation of their bias, which the filter estimates (1° of tilt is 0.17 m/s²)",
+            "m/s²",
+            high=100,
+            above=0,
         ),
     ] = 0.1
-    inertial_bias_s: Annotated[
-        float, Meta(ge=0.1, le=MAX_DURATION_S, description="time in which that comes and goes [s]")
-    ] = 20.0
+    inertial_bias_s: Annotated[float, declare("time in which that comes and goes", "s", 0.1, MAX_DURATION_S)] = 20.0
 
 
 class FallbackConfig(Section, frozen=True, kw_only=True):
     """Fallback that takes over when the age of information reaches H."""
 
-    brake_gain_1ps: Annotated[
-        float, Meta(ge=1e-6, le=1000, description="deceleration per predicted speed while braking [1/s]")
-    ] = 1.5
-    brake_s: Annotated[
-        float, Meta(ge=0, le=MAX_DURATION_S, description="longest time of braking on the prediction [s]")
-    ] = 2.0
-    hold_s: Annotated[float, Meta(ge=0, le=MAX_DURATION_S, description="then zero acceleration for this long [s]")] = (
-        3.0
-    )
+    brake_gain_1ps: Annotated[float, declare("deceleration per predicted speed while braking", "1/s", 1e-6, 1000)] = 1.5
+    brake_s: Annotated[float, declare("longest time of braking on the prediction", "s", 0, MAX_DURATION_S)] = 2.0
+    hold_s: Annotated[float, declare("then zero acceleration for this long", "s", 0, MAX_DURATION_S)] = 3.0
     blind_hold_s: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=MAX_DURATION_S,
-            description="for no longer than this where nothing tells whether it drifts: no position of late, and the "
-            "vehicle's own velocity does not come, or nothing speaks for it [s]",
+        declare(
+            "longest hold without a recent position and a credible velocity of the vehicle", "s", 0, MAX_DURATION_S
         ),
     ] = 0.5
-    land: Annotated[bool, Meta(description="then hand over to the vehicle's own landing mode (else hold on)")] = True
-    recover_samples: Annotated[
-        int, Meta(ge=1, le=1000, description="fresh samples in a row before plans are flown again")
-    ] = 3
+    land: Annotated[bool, declare("then hand over to the vehicle's own landing mode (else hold on)")] = True
+    recover_samples: Annotated[int, declare("fresh samples in a row before plans are flown again", "", 1, 1000)] = 3
     jump_s: Annotated[
         float,
-        Meta(
-            ge=0.001,
-            le=60,
-            description="positions that the vehicle cannot have come to, and that agree for this long, are a source "
-            "that moved: brake and land, and plans are not flown again [s]",
+        declare(
+            "time for which impossible positions must agree to count as a source that moved: brake, land",
+            "s",
+            0.001,
+            60,
         ),
     ] = 1.2
 
@@ -508,12 +368,8 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
 class LimitsConfig(Section, frozen=True, kw_only=True):
     """The setpoint limiter on a setpoint."""
 
-    accel_mps2: Annotated[
-        Position, Meta(description="largest acceleration setpoint of each axis, north, east, down [m/s²]")
-    ]
-    slew_mps3: Annotated[
-        float, Meta(ge=1e-6, le=1e6, description="largest change of a setpoint in a second, each axis [m/s³]")
-    ]
+    accel_mps2: Annotated[Position, declare("largest acceleration setpoint of each axis, north, east, down", "m/s²")]
+    slew_mps3: Annotated[float, declare("largest change of a setpoint in a second, each axis", "m/s³", 1e-6, 1e6)]
 
 
 Bound = Annotated[float, Meta(gt=0, le=1e6)] | None
@@ -523,34 +379,28 @@ class EnvelopeConfig(Section, frozen=True, kw_only=True):
     """Bounds of what is possible in flight; beyond them the vehicle is let go: level, then its own landing."""
 
     outside_m: Annotated[
-        Bound,
-        Meta(
-            description="how far the estimate may be beyond the position limits of `[sets]`, or come to by braking; "
-            "without it a tenth of the room in that axis, at least 0.5 [m]"
-        ),
+        Bound, declare("how far the estimate may be outside `[sets]`; default: a tenth of the room, at least 0.5", "m")
     ] = None
     unexplained_mps2: Annotated[
         Bound,
-        Meta(
-            description="acceleration that positions may show beside the setpoints sent: wind, and the model's error, "
-            "not a frame that is turned; without it six standard deviations of the plant's disturbance, at least 1.5 "
-            "[m/s²]"
+        declare(
+            "largest acceleration that no setpoint explains; default: 6 standard deviations of the "
+            "disturbance, at least 1.5",
+            "m/s²",
         ),
     ] = None
     disagreement_mps: Annotated[
         Bound,
-        Meta(
-            description="difference between the velocity that positions show and the vehicle's own, where that comes; "
-            "without it what unexplained_mps2 makes in 0.17 s [m/s]"
+        declare(
+            "largest difference of the velocity by positions and the vehicle's own; default: unexplained_mps2 "
+            "for 0.17 s",
+            "m/s",
         ),
     ] = None
     lead_s: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=10,
-            description="a flight's first motion begins with the horizontal axis that has the shorter way to go, and "
-            "the other one follows after this time: a frame mirrored along the way shows nothing on it [s]",
+        declare(
+            "lead of the axis with the shorter way in a first motion: along one axis a mirrored frame shows", "s", 0, 10
         ),
     ] = 0.3
 
@@ -558,8 +408,8 @@ class EnvelopeConfig(Section, frozen=True, kw_only=True):
 class Config(Section, frozen=True, kw_only=True):
     """A complete configuration."""
 
-    name: Annotated[str, Meta(max_length=100, description="name of the configuration")]
-    duration_s: Annotated[float, Meta(gt=0, le=MAX_DURATION_S, description="length of a loopback flight [s]")] = 40.0
+    name: Annotated[str, declare("name of the configuration", length=100)]
+    duration_s: Annotated[float, declare("length of a loopback flight", "s", high=MAX_DURATION_S, above=0)] = 40.0
     plant: PlantConfig
     sets: SetsConfig
     cost: CostConfig
@@ -584,7 +434,7 @@ class Config(Section, frozen=True, kw_only=True):
     security: SecurityConfig = SecurityConfig()
     log: LogConfig = LogConfig()
     mission: MissionConfig = MissionConfig()
-    fence: Annotated[tuple[FenceConfig, ...], Meta(max_length=50, description="limits that change in flight")] = ()
+    fence: Annotated[tuple[FenceConfig, ...], declare("limits that change in flight", length=50)] = ()
 
     def __repr__(self) -> str:
         """Return one line; `dump_config` has all keys."""

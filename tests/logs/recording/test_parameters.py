@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable
 from pathlib import Path
-from random import Random
 
 import msgspec
 import pytest
@@ -76,26 +75,6 @@ def test_what_is_damaged_tells_nothing() -> None:
     bad = bytearray(told("A", 1.0, INT32))
     bad[12] ^= 1
     assert read([bytes(bad), told("A", 1.0, INT32)[:-1]]) == {}
-
-
-def test_frames_that_are_skipped_tell_what_reading_them_would(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = Random(11)
-    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    for _ in range(200):
-        frames = []
-        for number in range(rng.randrange(1, 9)):
-            attitude = mavlink.MAVLink_attitude_message(number, 0, 0, 0, 0, 0, 0)
-            bare, old = attitude.pack(mav), attitude.pack(mav, force_mavlink1=True)
-            noise = bytes(rng.choice((0xFD, 0xFE, 0, 9)) for _ in range(rng.randrange(3)))
-            name = f"P{rng.randrange(4)}"
-            frames.append(rng.choice((bare, bare, bare, old, noise, bare[:-2], told(name, float(number), INT32))))
-        whole = b"".join(frames)
-        cuts = sorted(rng.randrange(len(whole) + 1) for _ in range(rng.randrange(3)))
-        chunks = [whole[a:b] for a, b in zip([0, *cuts], [*cuts, len(whole)], strict=True)]
-        quick = read(chunks)
-        with monkeypatch.context() as patch:
-            patch.setattr("logs.recording.parameters._find_frame", lambda _: 0)
-            assert read(chunks) == quick, chunks
 
 
 def test_the_file_is_one_of_qgroundcontrol() -> None:

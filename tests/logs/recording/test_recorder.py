@@ -10,25 +10,16 @@ from recording_fakes import Clock, Disk, drop_recorder_notes, flight, round_reco
 from view_rig import fly_view
 
 import logs.recording.recorder as recorder_module
-from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.file_scan import EndOfFile, RecordedMessage, scan_file
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import find_segments, read, read_kind
-from logs.recording.recorder import (
-    RECORDS,
-    VIEWS,
-    DerivedTopics,
-    Recorder,
-    SyncRecorder,
-    WriteQueue,
-    compute_batch_size,
-)
+from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder, WriteQueue
 from logs.recording.topics import is_view
 from logs.recording.views import ViewBuilder
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
-from uavctl.records import Datagram, Event, Record, Severity
+from uavctl.records import Datagram, Event, Severity
 
 EVENT = Event(at_ns=1, severity=Severity.INFO, code="x", text="y")
 
@@ -157,63 +148,14 @@ def test_the_first_drop_is_noted_before_what_was_put_after_it(tmp_path: Path) ->
     log = LogConfig(chunk_bytes=1024)
     journal = WriteQueue(path, log, DiskFile, lambda _: None, Clock(), DerivedTopics())
     journal.queue.extend(items[:50])
-    journal.drain(1, 0)
+    journal.drain(1)
     journal.drop()  # item 50
-    journal.drain(10, 0)
+    journal.drain(10)
     journal.queue.extend(items[51:])
-    journal.drain(100, 0)
+    journal.drain(100)
     found = [record for _, _, record in read(path)]  # as after a kill
     dropped = [number for number, one in enumerate(found) if isinstance(one, RecorderNote) and one.dropped == 1]
     assert len(dropped) == 1 and items[49][2] in found[dropped[0] :] and items[51][2] in found[dropped[0] :]
-
-
-def test_all_that_waits_is_written_before_anything_is_made_for_viewers(tmp_path: Path) -> None:
-    path = tmp_path / "flight.mcap"
-    reached, released = threading.Event(), threading.Event()
-    on_disk: list[int] = []
-
-    def open_file(path: Path) -> OutputFile:
-        reached.set()
-        released.wait()
-        return DiskFile(path)
-
-    class Looking:
-        def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
-            on_disk.append(len(drop_recorder_notes(list(read(path)))))
-            return []
-
-    items = flight(RECORDS)
-    recorder = Recorder(path, LogConfig(chunk_bytes=1024), open_file=open_file, derived_topics=DerivedTopics(Looking()))
-    recorder.put(*items[0])
-    assert reached.wait(30.0)  # the first round took one record
-    for item in items[1:]:
-        recorder.put(*item)
-    released.set()
-    assert recorder.close().ok
-    assert drop_recorder_notes(list(read(path))) == items
-    assert on_disk[0] == 1
-    assert on_disk[1] > RECORDS - 1024 // 31  # but for the open chunk
-    assert len(on_disk) == len(items)
-
-
-def test_views_that_a_rest_overtakes_are_written_after_it(tmp_path: Path) -> None:
-    class Same:
-        def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
-            return [(LOG, record.code.encode())] if isinstance(record, Event) else []
-
-    path = tmp_path / "flight.mcap"
-    log, clock, free = LogConfig(), Clock(), [10**9]
-    journal = WriteQueue(path, log, DiskFile, lambda _: free[0], clock, DerivedTopics(Same()))
-    items = flight(30)
-    journal.queue.extend(items)
-    journal.drain(len(items), 0)
-    free[0], clock.now_s = 0, 2.0
-    journal.drain(0, len(items))  # the file is closed before anything is made
-    assert journal.status().reason and len(journal.views_due) == len(items)
-    journal.finish()
-    assert drop_recorder_notes(list(read(path))) == items
-    files = [[one for one in scan_file(file) if isinstance(one, RecordedMessage)] for file in find_segments(path)]
-    assert [sum(one.definition.topic == LOG for one in file) for file in files] == [0, 10]
 
 
 @pytest.mark.fault(29)
@@ -253,11 +195,11 @@ def test_a_thread_that_dies_costs_no_record(has_ticks: bool, tmp_path: Path, mon
     path, items, dead = tmp_path / "flight.mcap", flight(200), threading.Event()
     plain = WriteQueue.drain
 
-    def drain(queue: WriteQueue, records: int, views: int) -> None:
+    def drain(queue: WriteQueue, records: int) -> None:
         if not dead.is_set():
             dead.set()
             raise SystemExit
-        plain(queue, records, views)
+        plain(queue, records)
 
     monkeypatch.setattr(WriteQueue, "drain", drain)
     recorder = Recorder(path)
@@ -273,13 +215,3 @@ def test_a_thread_that_dies_costs_no_record(has_ticks: bool, tmp_path: Path, mon
     assert status.ok and status.waiting == 0
     assert drop_recorder_notes(list(read(path))) == round_records(items)
     assert [one.finished for one in scan_file(path) if isinstance(one, EndOfFile)] == [True]
-
-
-def test_a_large_backlog_is_written_in_shares() -> None:
-    assert compute_batch_size(0, RECORDS) == compute_batch_size(RECORDS, RECORDS) == RECORDS
-    assert compute_batch_size(8000, RECORDS) == 1000
-    waiting, rounds = 8192, 0
-    while waiting > VIEWS:
-        waiting += 24 - compute_batch_size(waiting, VIEWS)  # 24 more come in the time of a round, 1200 a second
-        rounds += 1
-    assert rounds < 100  # two seconds

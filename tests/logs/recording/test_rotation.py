@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from recording_fakes import HEADER, Clock, Disk, Item, drop_recorder_notes, flight
 
 from logs.recording.derived_topics import LOG
-from logs.recording.disk import DiskFile, FreeSpaceMonitor
+from logs.recording.disk import DiskFile
 from logs.recording.file_kind import MAGIC
 from logs.recording.info import read_info
 from logs.recording.notes import RecorderNote
@@ -28,12 +28,12 @@ from logs.recording.topics import get_definition
 from logs.recording.views import ViewBuilder
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig
-from uavctl.errors import ConfigError, RecordingError
+from uavctl.errors import RecordingError
 from uavctl.records import Header
 from uavctl.wiring.controller import build_design
 
 SMALL = LogConfig(chunk_bytes=1024, segment_bytes=3000)
-LOW, STOP = 3000, 1000
+LOW = 3000
 
 
 def fly(recorder: SyncRecorder, clock: Clock, items: list[Item]) -> None:
@@ -227,69 +227,21 @@ class Room:
         return self.free
 
 
-def test_the_watch_warns_rests_and_goes_on_with_a_margin() -> None:
-    room = Room()
-    watch = FreeSpaceMonitor(Path("flights"), room, LOW, STOP)
-    seen = []
-    for room.free in (3000, 2999, 1000, 999, 1500, 2999, None, 3000, 1500):
-        watch.check()
-        seen.append((watch.low, watch.is_paused))
-    low, rest, well = (True, False), (True, True), (False, False)
-    assert seen == [well, low, low, rest, rest, rest, rest, well, low]
-
-
-@pytest.mark.fault(29)
-def test_29_recording_rests_before_the_disk_is_full_and_goes_on_when_there_is_room(tmp_path: Path) -> None:
-    path = tmp_path / "flight.mcap"
-    items = flight(400)
-    room, clock, disk = Room(), Clock(), Disk()
-    log = LogConfig(chunk_bytes=1024, queue=50, low_bytes=LOW, stop_bytes=STOP)
-    recorder = SyncRecorder(path, log, open_file=disk.open, free=room, clock=clock)
-    fly(recorder, clock, items[:100])
-    assert recorder.status().warning == ""
-    room.free = 2000
-    fly(recorder, clock, items[100:120])
-    status = recorder.status()
-    assert status.ok and "2000 bytes free" in status.warning
-    room.free = 900
-    fly(recorder, clock, items[120:140])
-    status = recorder.status()
-    assert not status.ok and "rests until there are 3000" in status.reason
-    with path.open("rb") as file:  # closed in order
-        summary = make_reader(file, validate_crcs=True).get_summary()
-    assert summary is not None
-    before = disk.operations
-    fly(recorder, clock, items[140:300])
-    assert disk.operations == before  # the disk is left alone, the flight goes on
-    assert recorder.status().waiting == 50
-    room.free = 5000
-    clock.now_s += 1.0
-    fly(recorder, clock, items[300:])
-    final = recorder.close()
-    got = drop_recorder_notes(list(read(path)))
-    assert got == [item for item in items if item in got]
-    assert got[-90:] == items[-90:]
-    assert len(items) - len(got) == final.dropped == read_info(path).dropped > 0
-    said = " | ".join(one.text for one in read_info(path).notes)
-    for text in ("disk gets low: 2000 bytes", "900 bytes free", "after a rest", "disk has room again"):
-        assert text in said
-    assert [one.finished for one in read_info(path).segments] == [True, True]
-
-
-@pytest.mark.fault(29)
-def test_29_what_waited_in_a_rest_is_written_at_the_end(tmp_path: Path) -> None:
+def test_a_low_disk_is_a_warning_until_it_has_room_again(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     items = flight(60)
     room, clock = Room(), Clock()
-    log = LogConfig(chunk_bytes=1024, low_bytes=LOW, stop_bytes=STOP)
-    recorder = SyncRecorder(path, log, free=room, clock=clock)
-    fly(recorder, clock, items[:20])
-    room.free = 0
-    fly(recorder, clock, items[20:])
-    assert len(drop_recorder_notes(list(read(path)))) < 35
-    status = recorder.close()
-    assert status.ok
-    assert drop_recorder_notes(list(read(path))) == items
+    recorder = SyncRecorder(path, LogConfig(low_bytes=LOW), free=room, clock=clock)
+    warnings = []
+    for number, room.free in enumerate((3000, 2999, None, 3000)):
+        fly(recorder, clock, items[15 * number : 15 * (number + 1)])
+        assert recorder.status().ok
+        warnings.append(recorder.status().warning.partition(" in ")[0])
+    assert warnings == ["", "2999 bytes free", "2999 bytes free", ""]
+    fly(recorder, clock, items[60:])
+    assert recorder.close().ok and drop_recorder_notes(list(read(path))) == items
+    notes = [one.text.partition(" in ")[0] for one in read_info(path).notes]
+    assert notes == ["disk gets low: 2999 bytes free", "disk has room again: 3000 bytes free"]
 
 
 @pytest.mark.fault(29)
@@ -297,7 +249,7 @@ def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
     seen: list[tuple[str, bytes]] = []
     room, clock = Room(), Clock()
     looking = DerivedTopics(ViewBuilder(), lambda topic, _, data: seen.append((topic, data)))
-    log = LogConfig(low_bytes=LOW, stop_bytes=STOP)
+    log = LogConfig(low_bytes=LOW)
     recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, derived_topics=looking)
     loaded = load_config("room-hahn-stursberg")
     recorder.put("/uavctl/header", 0, made_header(loaded, build_design(loaded)))
@@ -335,8 +287,3 @@ def test_32_a_flipped_byte_in_a_later_file_is_refused_or_restored(tmp_path: Path
             assert result.damage and (left == items or not result.lossless), position
         file.write_bytes(data)
     assert drop_recorder_notes(list(read(path))) == items
-
-
-def test_a_warning_that_cannot_come_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"log\.stop_bytes.*more than log\.low_bytes"):
-        load_config("room", ["log.stop_bytes=40000000"])

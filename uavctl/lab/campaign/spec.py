@@ -1,6 +1,6 @@
 """Specification of a campaign: its file, its types, and the configurations that it describes.
 
-1. The sections are the TOML tables of the file. Every key has its unit and meaning in `Meta(description=...)`.
+1. The sections are the TOML tables of the file. Every key is declared with its meaning, unit and range.
 2. `compose` makes every configuration: those of the flown links and plants, and the belief of each controller.
 3. `read_campaign` reads a file and reports all problems at once.
 """
@@ -27,6 +27,7 @@ from uavctl.config.document import (
     Floats,
     Rows,
     Section,
+    declare,
     find_key_lines,
     find_oversized,
     read_text,
@@ -81,27 +82,25 @@ class ControllerSpec(Section, frozen=True, kw_only=True):
     name: Name
     kind: Annotated[
         str,
-        Meta(
-            min_length=1,
-            max_length=200,
-            description=f"what it is: {', '.join(f'`{kind}`' for kind in KINDS)}; or a controller of another package, "
+        declare(
+            f"what it is: {', '.join(f'`{kind}`' for kind in KINDS)}; or a controller of another package, "
             "by the name of its entry point `uavctl.controllers` or as `module:Class`",
+            length=(1, 200),
         ),
     ]
-    set: Annotated[
-        Overrides, Meta(description="overrides of the configuration that it is designed from: what it believes")
-    ] = ()
+    set: Annotated[Overrides, declare("overrides of the configuration that it is designed from: what it believes")] = ()
     link: Annotated[
-        str, Meta(description="the link that it believes in: `true`, the one it flies on, or the name of a [[link]]")
+        str, declare("the link that it believes in: `true`, the one it flies on, or the name of a [[link]]")
     ] = TRUE_LINK
     margin: Annotated[
         float,
-        Meta(
-            ge=0,
-            le=1000,
-            description="with `packetised`, `hold-last` and `zero-on-loss`: how far plans keep from the state limits, "
-            "in standard deviations of one step's disturbance; with `mean-qp` and `governor`: in those of a prediction "
-            "as old as the stage",
+        declare(
+            "with `packetised`, `hold-last` and `zero-on-loss`: how far plans keep from the state limits, in "
+            "standard deviations of one step's disturbance; with `mean-qp` and `governor`: in those of a "
+            "prediction as old as the stage",
+            "",
+            0,
+            1000,
         ),
     ] = 0.0
 
@@ -110,7 +109,7 @@ class LinkSpec(Section, frozen=True, kw_only=True):
     """One link."""
 
     name: Name
-    set: Annotated[Overrides, Meta(description="overrides of the configuration's [link]")] = ()
+    set: Annotated[Overrides, declare("overrides of the configuration's", "link")] = ()
 
 
 class DisturbanceSpec(Section, frozen=True, kw_only=True):
@@ -119,39 +118,32 @@ class DisturbanceSpec(Section, frozen=True, kw_only=True):
     name: Name
     kind: Annotated[
         DisturbanceKind,
-        Meta(
-            description="`gaussian`; `uniform`; `heavy`: Student's t with 4 degrees; `gusts`: each step keeps `memory` "
-            "of the last one's. All have the plant's covariance W, times scale²"
+        declare(
+            "`gaussian`; `uniform`; `heavy`: Student's t with 4 degrees; `gusts`: each step keeps `memory` of "
+            "the last one's. All have the plant's covariance W, times scale²"
         ),
     ] = "gaussian"
-    scale: Annotated[float, Meta(ge=0, le=1e6, description="factor of W's standard deviations")] = 1.0
-    bias: Annotated[float, Meta(ge=-1e6, le=1e6, description="constant that is added, in standard deviations of W")] = (
-        0.0
-    )
-    memory: Annotated[float, Meta(ge=0, lt=1, description="with `gusts`: correlation of a step with the next")] = 0.0
+    scale: Annotated[float, declare("factor of W's standard deviations", "", 0, 1e6)] = 1.0
+    bias: Annotated[float, declare("constant that is added, in standard deviations of W", "", -1e6, 1e6)] = 0.0
+    memory: Annotated[float, declare("with `gusts`: correlation of a step with the next", low=0, below=1)] = 0.0
 
 
 class PlantSpec(Section, frozen=True, kw_only=True):
     """One plant that is flown; the controllers go on believing in the configuration's."""
 
     name: Name
-    set: Annotated[Overrides, Meta(description="overrides of the configuration's [plant]")] = ()
+    set: Annotated[Overrides, declare("overrides of the configuration's", "plant")] = ()
 
 
 class TuningSpec(Section, frozen=True, kw_only=True):
     """Settings that differ for some controllers on the links that they believe in."""
 
-    controllers: Annotated[
-        tuple[str, ...], Meta(min_length=1, max_length=MAX_TABLES, description="names of [[controller]]s")
-    ]
-    links: Annotated[
-        tuple[str, ...],
-        Meta(min_length=1, max_length=MAX_TABLES, description="names of [[link]]s that they believe in"),
-    ]
-    set: Annotated[Overrides, Meta(description="overrides of the design; they win over the controller's")] = ()
+    controllers: Annotated[tuple[str, ...], declare("names of [[controller]]s", length=(1, MAX_TABLES))]
+    links: Annotated[tuple[str, ...], declare("names of [[link]]s that they believe in", length=(1, MAX_TABLES))]
+    set: Annotated[Overrides, declare("overrides of the design; they win over the controller's")] = ()
     margin: Annotated[
         Annotated[float, Meta(ge=0, le=1000)] | None,
-        Meta(description="their `margin` there; if not given, the controllers' own"),
+        declare("their `margin` there; if not given, the controllers' own"),
     ] = None
 
 
@@ -159,47 +151,32 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     """A campaign: every controller on every link in every disturbance with every plant, each for the same runs."""
 
     name: Annotated[
-        str,
-        Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$", description="name of the campaign; part of its folder's name"),
+        str, declare("name of the campaign; part of its folder's name", pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$")
     ]
-    config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
-    set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
-    steps: Annotated[int, Meta(ge=2, le=100_000, description="steps of a run")] = 50
-    runs: Annotated[int, Meta(ge=1, le=MAX_RUNS, description="runs of each cell")] = 1000
-    master: Annotated[
-        int, Meta(ge=0, le=MAX_SEED, description="seed: run i's draws come from (master, i), in every cell")
-    ] = 0
+    config: Annotated[str, declare("flight configuration: a preset, or a file, seen from the campaign's")]
+    set: Annotated[Overrides, declare("overrides of the configuration, for all")] = ()
+    steps: Annotated[int, declare("steps of a run", "", 2, 100_000)] = 50
+    runs: Annotated[int, declare("runs of each cell", "", 1, MAX_RUNS)] = 1000
+    master: Annotated[int, declare("seed: run i's draws come from (master, i), in every cell", "", 0, MAX_SEED)] = 0
     measured: Annotated[
         MeasuredQuantity,
-        Meta(
-            description="what a controller is told of a step whose position comes: `state`, all of it, exactly; or "
-            "`position`, with the noise of `sim.camera.noise_std_m`, of which the flight's filter (its `[estimator]`, "
-            "without a bias) makes state and covariance"
+        declare(
+            "what a controller is told of a step whose position comes: `state`, all of it, exactly; or "
+            "`position`, with the noise of `sim.camera.noise_std_m`, of which the flight's filter (its "
+            "`[estimator]`, without a bias) makes state and covariance"
         ),
     ] = "state"
-    start: Annotated[
-        Floats, Meta(max_length=MAX_STATES, description="state (n_x) in which every run starts; else sim.start_*")
-    ] = ()
+    start: Annotated[Floats, declare("state (n_x) in which every run starts; else sim.start_*", length=MAX_STATES)] = ()
     start_box: Annotated[
-        Rows,
-        Meta(
-            max_length=2,
-            description="[lower, upper] (n_x each): each run starts at a state drawn uniformly from this box",
-        ),
+        Rows, declare("[lower, upper] (n_x each): each run starts at a state drawn uniformly from this box", length=2)
     ] = ()
-    controller: Annotated[tuple[ControllerSpec, ...], Meta(max_length=MAX_TABLES, description="controllers")]
-    link: Annotated[tuple[LinkSpec, ...], Meta(max_length=MAX_TABLES, description="links")] = (
-        LinkSpec(name="as configured"),
-    )
-    disturbance: Annotated[tuple[DisturbanceSpec, ...], Meta(max_length=MAX_TABLES, description="disturbances")] = (
+    controller: Annotated[tuple[ControllerSpec, ...], declare("controllers", length=MAX_TABLES)]
+    link: Annotated[tuple[LinkSpec, ...], declare("links", length=MAX_TABLES)] = (LinkSpec(name="as configured"),)
+    disturbance: Annotated[tuple[DisturbanceSpec, ...], declare("disturbances", length=MAX_TABLES)] = (
         DisturbanceSpec(name="gaussian"),
     )
-    plant: Annotated[tuple[PlantSpec, ...], Meta(max_length=MAX_TABLES, description="plants")] = (
-        PlantSpec(name="as modelled"),
-    )
-    tuning: Annotated[
-        tuple[TuningSpec, ...], Meta(max_length=MAX_TABLES, description="settings of controllers on some links")
-    ] = ()
+    plant: Annotated[tuple[PlantSpec, ...], declare("plants", length=MAX_TABLES)] = (PlantSpec(name="as modelled"),)
+    tuning: Annotated[tuple[TuningSpec, ...], declare("settings of controllers on some links", length=MAX_TABLES)] = ()
 
 
 CONFIGURATION = "the configuration"

@@ -18,7 +18,7 @@ from msgspec import Meta
 from logs.report.statistics import replace_infinite
 from uavctl import __version__
 from uavctl.config import Config, dump_config, load, load_config, parse
-from uavctl.config.document import MAX_SEED, ConfigProblem, Section
+from uavctl.config.document import MAX_SEED, ConfigProblem, Section, declare
 from uavctl.config.load import parse_toml
 from uavctl.errors import RAISED, ConfigError, DesignError, in_words
 from uavctl.lab.campaign.pool import Columns, Work
@@ -63,15 +63,15 @@ class TrialControllerSpec(Section, frozen=True, kw_only=True):
     name: Name
     kind: Annotated[
         Literal["smpc", "own-loop"],
-        Meta(description="`smpc`: ours; `own-loop`: the vehicle's own position loop on the same positions"),
+        declare("`smpc`: ours; `own-loop`: the vehicle's own position loop on the same positions"),
     ]
-    set: Annotated[Overrides, Meta(description="with `smpc`: overrides of the configuration that it is made from")] = ()
+    set: Annotated[Overrides, declare("with `smpc`: overrides of the configuration that it is made from")] = ()
     link: Annotated[
         Literal["true", "configured"],
-        Meta(description="with `smpc`: the link that it is designed for: the one it flies on, or its configuration's"),
+        declare("with `smpc`: the link that it is designed for: the one it flies on, or its configuration's"),
     ] = "true"
     tuned: Annotated[
-        bool, Meta(description="with `own-loop`: gains, delay and lead as tuned for preset `room`; else as delivered")
+        bool, declare("with `own-loop`: gains, delay and lead as tuned for preset `room`; else as delivered")
     ] = False
 
 
@@ -79,52 +79,38 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     """A campaign of flights of the true quadrotor: every controller in every scenario, each for the same runs."""
 
     name: Annotated[
-        str,
-        Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$", description="name of the campaign; part of its folder's name"),
+        str, declare("name of the campaign; part of its folder's name", pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$")
     ]
-    world: Annotated[
-        Literal["quadrotor"], Meta(description="`quadrotor`: rigid body, rotors, wind and an autopilot's loops")
-    ]
-    config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
-    set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
-    runs: Annotated[int, Meta(ge=1, le=MAX_TRIALS, description="flights of each cell")] = 20
-    master: Annotated[
-        int, Meta(ge=0, le=MAX_SEED, description="seed: flight i's draws come from (master, i), in every cell")
-    ] = 0
-    seconds: Annotated[
-        float, Meta(ge=1, le=3600, description="length of a flight; a figure of eight has its own [s]")
-    ] = 40.0
-    from_s: Annotated[float, Meta(ge=0, le=3600, description="from when on the target is to be held [s]")] = 10.0
+    world: Annotated[Literal["quadrotor"], declare("`quadrotor`: rigid body, rotors, wind and an autopilot's loops")]
+    config: Annotated[str, declare("flight configuration: a preset, or a file, seen from the campaign's")]
+    set: Annotated[Overrides, declare("overrides of the configuration, for all")] = ()
+    runs: Annotated[int, declare("flights of each cell", "", 1, MAX_TRIALS)] = 20
+    master: Annotated[int, declare("seed: flight i's draws come from (master, i), in every cell", "", 0, MAX_SEED)] = 0
+    seconds: Annotated[float, declare("length of a flight; a figure of eight has its own", "s", 1, 3600)] = 40.0
+    from_s: Annotated[float, declare("from when on the target is to be held", "s", 0, 3600)] = 10.0
     scenario: Annotated[
         tuple[Scenario, ...],
-        Meta(
-            min_length=1,
-            max_length=3,
-            description="`hold`: from the start to the target, and hold it; `eight`: three times around a figure of "
-            "eight, 0.76 m/s in the mean and 1.5 m/s at most; `blackout`: `hold` with 4 s without any position",
+        declare(
+            "`hold`: from the start to the target, and hold it; `eight`: three times around a figure of eight, "
+            "0.76 m/s in the mean and 1.5 m/s at most; `blackout`: `hold` with 4 s without any position",
+            length=(1, 3),
         ),
     ] = SCENARIOS
-    autopilot: Annotated[
-        tuple[AutopilotName, ...], Meta(min_length=1, max_length=2, description="whose behaviour the vehicle shows")
-    ] = AUTOPILOTS
+    autopilot: Annotated[tuple[AutopilotName, ...], declare("whose behaviour the vehicle shows", length=(1, 2))] = (
+        AUTOPILOTS
+    )
     rate_hz: Annotated[
-        tuple[Rate, ...],
-        Meta(min_length=1, max_length=MAX_TABLES, description="positions a second that the cameras give [1/s]"),
+        tuple[Rate, ...], declare("positions a second that the cameras give", "1/s", length=(1, MAX_TABLES))
     ] = (5.0, 50.0)
     air: Annotated[
         tuple[Air, ...],
-        Meta(
-            min_length=1,
-            max_length=3,
-            description="`calm`, or 0.7 m/s of wind with `gusts` (gust_wind_mps 3) or `strong-gusts` (gust_wind_mps 8)",
+        declare(
+            "`calm`, or 0.7 m/s of wind with `gusts` (gust_wind_mps 3) or `strong-gusts` (gust_wind_mps 8)",
+            length=(1, 3),
         ),
     ] = ("gusts",)
-    controller: Annotated[
-        tuple[TrialControllerSpec, ...], Meta(min_length=1, max_length=MAX_TABLES, description="who flies")
-    ]
-    link: Annotated[tuple[LinkSpec, ...], Meta(min_length=1, max_length=MAX_TABLES, description="links")] = (
-        LinkSpec(name="as configured"),
-    )
+    controller: Annotated[tuple[TrialControllerSpec, ...], declare("who flies", length=(1, MAX_TABLES))]
+    link: Annotated[tuple[LinkSpec, ...], declare("links", length=(1, MAX_TABLES))] = (LinkSpec(name="as configured"),)
 
 
 VERSION = 1
