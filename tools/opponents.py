@@ -68,14 +68,14 @@ class LqrByAge(Lqg):
 
 def find_shape(problem: ControlProblem, newest: Counts) -> Array:
     """Find the distances of the ages (n,) on a link as drawn, the largest of them 1."""
-    ages = np.minimum(np.arange(newest.shape[1]) - newest[:, :], HORIZON - 1)[:, SETTLED:]
+    ages = np.minimum(np.arange(newest.shape[1]) - newest, HORIZON - 1)[:, SETTLED:]
     shares = np.bincount(ages.ravel(), minlength=HORIZON).astype(float)
     # A position that is late is never young; from the most frequent age on, shares fall
     youngest = int(shares.argmax())
     shares = np.minimum.accumulate(shares[youngest:])
     (row,) = np.flatnonzero(problem.state_set.c[:, 0] > 0.0)
     distances = find_distances(make_problem(1), np.maximum(shares, 1e-12), int(row), ALLOWED)
-    return np.concatenate([np.full(youngest, distances[0]), distances]) / distances.max()
+    return np.asarray(np.concatenate([np.full(youngest, distances[0]), distances]) / distances.max())
 
 
 def make_controller(

@@ -22,8 +22,10 @@ N = -B K x_s(1), and the probabilities g_j that a silence ends after age j:
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import NonlinearConstraint, minimize
 from scipy.special import ndtr
 
 from uavctl.arrays import Array
@@ -88,25 +90,29 @@ def find_distances(problem: ControlProblem, shares: Array, row: int, allowed: fl
 
     margins = -np.einsum("i,jin->jn", c, after)
 
-    def find_spare_risk(y: Array) -> float:
+    def find_spare_risk(y: Any) -> Any:
         # 1 - δ_x - Σ_j π_j Φ(-margin_j / s_{j+1})
-        return allowed - float(shares @ ndtr(-(margins @ y) / deviations))
+        return allowed - shares @ ndtr(-(margins @ y) / deviations)
 
-    def find_spare_slope(y: Array) -> Array:
+    def find_spare_slope(y: Any) -> Any:
         density = np.exp(-0.5 * (margins @ y / deviations) ** 2) / np.sqrt(2.0 * np.pi)
-        return np.asarray((shares * density / deviations) @ margins)
+        return (shares * density / deviations) @ margins
 
     first = np.full(own, float(deviations[0]))
     while find_spare_risk(first) < 0.0:
         first *= 1.2
     cost /= float(first @ cost @ first)
+
+    def find_cost(y: Any) -> tuple[float, Any]:
+        return float(y @ cost @ y), 2.0 * cost @ y
+
     solution = minimize(
-        lambda y: float(y @ cost @ y),
+        find_cost,
         first,
-        jac=lambda y: 2.0 * cost @ y,
-        constraints=[{"type": "ineq", "fun": find_spare_risk, "jac": find_spare_slope}],
+        jac=True,
+        constraints=NonlinearConstraint(find_spare_risk, 0.0, np.inf, jac=find_spare_slope),
         method="SLSQP",
-        options={"maxiter": 300, "ftol": 1e-10},
+        tol=1e-10,
     )
     if not solution.success:
         raise ValueError(f"no distances by age: {solution.message}")
