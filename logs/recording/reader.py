@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,7 +18,10 @@ R = TypeVar("R", bound=Record)
 
 
 def find_segments(path: Path) -> tuple[Path, ...]:
-    """Return the files of a recording in order: the named one, and those that go on after a failed write.
+    """Return the files of a recording in order: the named one, and those that go on after it.
+
+    A file without any readable message is passed over. What it lacks is noticed by the numbers of the messages, or by
+    the last note of the file before.
 
     Raises:
         RecordingError: there is none, or the path is that of a folder.
@@ -28,16 +32,7 @@ def find_segments(path: Path) -> tuple[Path, ...]:
         hint = f"; give the recording in it: {', '.join(map(str, inside))}" if inside else " and holds no recording"
         raise RecordingError(f"{path}: is a folder{hint}")
     files = [path] if path.exists() else []
-    candidates = find_later_segments(path)
-    readable_files = [file for file in candidates if _has_message(file)]
-    for index, file in enumerate(candidates):
-        if file in readable_files:
-            is_part = _continues(file)
-        else:
-            following = next((later for later in candidates[index:] if later in readable_files), None)
-            is_part = not files or _lacks_messages(files[-1], following)
-        if is_part:
-            files.append(file)
+    files += [file for file in find_later_segments(path) if _continues(file)]
     if not files:
         raise RecordingError(f"{path}: no such recording")
     return tuple(files)
@@ -158,33 +153,13 @@ def read_messages(path: Path) -> Iterator[RecordedMessage]:
             raise RecordingError(f"{item}; `uavctl log recover {path} OUT` restores the rest")
 
 
-def _has_message(path: Path) -> bool:
-    """Return whether any message of a file can be read."""
-    try:
-        return any(isinstance(item, RecordedMessage) for item in scan_file(path))
-    except RecordingError:  # not a recording
-        return False
-
-
-def _lacks_messages(path: Path, following: Path | None) -> bool:
-    """Return whether messages may be missing between the end of a file and the next one, or the recording's end."""
-    end = read_last_chunk(path)
-    if not end:
-        return True
-    if following is None:
-        note = _find_last_note(end)
-        return note is None or not note.is_end
-    first = next((item for item in scan_file(following) if isinstance(item, RecordedMessage)), None)
-    return first is None or first.sequence != end[-1].sequence + 1
-
-
 def _continues(path: Path) -> bool:
-    """Return whether a file is followed by another one of the same recording."""
-    for count, item in enumerate(scan_file(path)):
-        if not isinstance(item, RecordedMessage):
-            return True  # empty or damaged: better told than passed over
-        if (note := decode_note(item)) is not None:
-            return note.segment > 1
-        if count == 1:
-            break
-    return False
+    """Return whether a file has messages of a recording that began in an earlier file."""
+    try:
+        begin = list(islice(scan_file(path), 2))
+        if all(isinstance(item, RecordedMessage) for item in begin):  # the header, repeated, and a note
+            notes = [decode_note(item) for item in begin if isinstance(item, RecordedMessage)]
+            return any(note is not None and note.segment > 1 for note in notes)
+        return any(isinstance(item, RecordedMessage) for item in scan_file(path))
+    except RecordingError:  # no recording
+        return False

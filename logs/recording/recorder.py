@@ -113,10 +113,10 @@ class WriteQueue:
 
     Args:
         path: file of the recording; it and its later segments must not exist yet.
-        log: sizes of chunks, files and queue; free space to keep.
+        log: sizes of chunks, files and queue; free space below which it warns.
         free: gives the free space of a folder [bytes], or None.
         clock: wall time [s].
-        onlookers: makes what is written beside the records for viewers.
+        derived_topics: makes the messages for viewers, which are written beside the records.
 
     Attributes:
         queue: topic, log time [ns] and record of what waits; who appends keeps to `log.queue`.
@@ -268,10 +268,14 @@ class WriteQueue:
             self._refusal = str(error)
             return
         derived = self._derived_topics.derive_messages(topic, at_ns, record, data)
-        self._files.write_record(topic, at_ns, data, derived)
-        if topic == HEADER:
-            self._write_note("begin", NoteKind.BEGIN)
-            self._files.commit()
+        try:
+            self._files.write_record(topic, at_ns, data)
+            if topic == HEADER:
+                self._write_note("begin", NoteKind.BEGIN)
+                self._files.commit()
+        finally:  # after a failed write they come after the record, in the next file
+            self._files.unwritten.extend(derived)
+        self._files.write_unwritten()
         if isinstance(record, Header):
             utc_ns = at_ns + self._files.zero_utc_ns
             self._files.attach(

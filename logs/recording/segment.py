@@ -492,8 +492,8 @@ class Rotation:
             if segment.open_entries and segment.open_entries[-1] is entry:  # else it is lost, and takes no number
                 self.written += 1
 
-    def write_record(self, topic: str, at_ns: int, data: bytes, derived: Sequence[tuple[str, int, bytes]] = ()) -> None:
-        """Add a record's message and those derived from it; the header is kept for later files.
+    def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
+        """Add a record's message; the header is kept for later files.
 
         Raises:
             OSError: as `write`.
@@ -502,8 +502,7 @@ class Rotation:
         if topic == HEADER:
             self._header = data
             self._header_bytes = len(ZstdCompressor(level=_LEVEL).compress(data))
-        self.unwritten.extend(((topic, at_ns, data), *derived))
-        self.write_unwritten()
+        self.write(topic, at_ns, data)
 
     def write_unwritten(self) -> None:
         """Write the messages that must go first into the new file.
