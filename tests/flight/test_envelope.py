@@ -504,7 +504,7 @@ def test_an_acceleration_that_noise_of_one_position_makes_counts_unless_the_own_
         assert verdict is not None and verdict.cause == EventCode.RESPONSE
     assert judge_single_position(size_mps2, agreeing_mps - 1e-3) is None
     # It has lasted, or no position is so far off.
-    for more_mps2, over_ns in ((0.0, AT_NS - 400 * MS), (20.0, None)):
+    for more_mps2, over_ns in ((0.0, AT_NS - 600 * MS), (20.0, None)):
         verdict = judge_single_position(size_mps2 + more_mps2, agreeing_mps - 1e-3, over_ns=over_ns)
         assert verdict is not None and verdict.cause == EventCode.RESPONSE
-    assert judge_single_position(size_mps2, agreeing_mps - 1e-3, over_ns=AT_NS - 400 * MS + 1) is None
+    assert judge_single_position(size_mps2, agreeing_mps - 1e-3, over_ns=AT_NS - 600 * MS + 1) is None
