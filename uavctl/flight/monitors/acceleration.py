@@ -40,7 +40,7 @@ MIN_SIGMA = 1.5  # it counts from so many of its standard deviations on,
 MIN_SIGMA_NOISY = 4.0  # and from so many where positions are noisier than `USUAL_STD_M`: chance alone makes two of them
 # Noise that may have begun, and standard deviations of it by which no position is off. No noise points the same way for
 # longer than `CERTAIN_NS`.
-NOISY_STD_M, CERTAIN_SIGMA, CERTAIN_NS = 0.05, 6.0, 400_000_000
+NOISY_STD_M, CERTAIN_SIGMA, CERTAIN_NS = 0.05, 8.0, 600_000_000
 HINT_RATIO = 0.4  # of the bound: above it, a difference of velocities counts at once
 CLEAN_RATIO = 0.5  # of the bound: up to it, a position is clean
 # Of the bound: a push that inertial data show explains nothing up to it, and a strong push ends at it.
@@ -86,7 +86,7 @@ def update(state: AccelerationState, observation: PositionObservation) -> tuple[
     sigma = MIN_SIGMA_NOISY if POSITION_STD_M < observation.std_m <= LARGEST_STD_M else MIN_SIGMA
     is_significant = beside_mps2 > sigma * math.sqrt(observer.cov[2, 2])
     over_ns = (state.over_ns or observation.at_ns) if ratio > 1.0 and is_significant else None
-    # |d| > 6 K_d σ with K_d = P_dp / R: more than noise of one position makes
+    # |d| > 8 K_d σ with K_d = P_dp / R: more than noise of one position makes
     noise = max(observation.std_m, POSITION_STD_M) ** 2
     has_lasted = over_ns is not None and observation.at_ns - over_ns >= CERTAIN_NS
     is_certain = has_lasted or beside_mps2 > CERTAIN_SIGMA * NOISY_STD_M * float(observer.cov[2, 0]) / noise
