@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -471,40 +470,3 @@ def test_where_positions_are_noisy_an_acceleration_counts_from_more_standard_dev
         )
         state, _ = acceleration.update(AccelerationState(), position)
         assert state.over_ns == (AT_NS if counts else None)
-
-
-def judge_single_position(
-    unexplained_mps2: float, apart_mps: float | None, *, over_ns: int | None = None
-) -> Verdict | None:
-    """What comes of a position whose noise may have made that acceleration, beside the vehicle's own velocity."""
-    s = 0.2
-    observer = Observer(
-        at_ns=AT_NS - round(s * 1e9),
-        mean=np.array([ZERO, (-s * unexplained_mps2, 0.0, 0.0), (unexplained_mps2, 0.0, 0.0)]),
-        cov=np.diag([1e-4, 0.01, 4.0]),
-        accel_mps2=np.zeros(3),
-    )
-    known: dict[str, Any] = {"observer": observer, "tick_ns": observer.at_ns, "sent": ((observer.at_ns, ZERO),)}
-    own = None
-    if apart_mps is not None:
-        own = motion(ZERO, AT_NS)
-        flown = tuple((AT_NS - ms * MS, (-1e-3 * ms * apart_mps, 0.0, 0.0)) for ms in (800, 400))
-        known |= {"vehicle_path": ((AT_NS - 900 * MS, ZERO), (AT_NS - 200 * MS, ZERO)), "offsets": flown}
-    place = vec3((-0.5 * s * s * unexplained_mps2, 0.0, 0.0))
-    known["offsets"] = tuple((at_ns, (o[0] + place[0], 0.0, 0.0)) for at_ns, o in known.get("offsets", ()))
-    watching = monitors(**known, over_ns=over_ns)
-    return update(watching, seen(AT_NS, sample(AT_NS, AT_NS, place), vehicle_motion=own), PARAMETERS)[1]
-
-
-def test_an_acceleration_that_noise_of_one_position_makes_counts_unless_the_own_velocity_agrees() -> None:
-    size_mps2 = 1.6 * PARAMETERS.unexplained_mps2
-    agreeing_mps = 0.75 * PARAMETERS.disagreement_mps
-    for apart_mps in (None, agreeing_mps + 1e-3):
-        verdict = judge_single_position(size_mps2, apart_mps)
-        assert verdict is not None and verdict.cause == EventCode.RESPONSE
-    assert judge_single_position(size_mps2, agreeing_mps - 1e-3) is None
-    # It has lasted, or no position is so far off.
-    for more_mps2, over_ns in ((0.0, AT_NS - 600 * MS), (20.0, None)):
-        verdict = judge_single_position(size_mps2 + more_mps2, agreeing_mps - 1e-3, over_ns=over_ns)
-        assert verdict is not None and verdict.cause == EventCode.RESPONSE
-    assert judge_single_position(size_mps2, agreeing_mps - 1e-3, over_ns=AT_NS - 600 * MS + 1) is None

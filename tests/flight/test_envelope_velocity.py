@@ -627,29 +627,3 @@ def test_noise_that_may_make_a_difference_is_no_contradiction(std_m: float, cont
     aligned = (0.1, [[0.0, 0.0, 0.0]])
     few = VelocityState(offsets=state.offsets[1:], places=((AT_NS - SECOND_NS, ZERO, ZERO),), aligned=aligned)
     assert velocity.update(few, position)[0].aligned == aligned
-
-
-@pytest.mark.parametrize("is_hinted", [False, True])
-def test_offsets_that_scatter_are_no_contradiction_unless_the_acceleration_hints_at_one(*, is_hinted: bool) -> None:
-    """Offsets -0.20, -0.02 and 0 m over 0.5 s: their line leaves (-0.08, 0.16, -0.08) / 3 m."""
-    flown = ((AT_NS - 500 * MS, (-0.20, 0.0, 0.0)), (AT_NS - 250 * MS, (-0.02, 0.0, 0.0)))
-    path = ((AT_NS - 600 * MS, ZERO), (AT_NS + MS, ZERO))
-    observer = Observer(AT_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
-    position = PositionObservation(
-        AT_NS, np.zeros(3), False, False, Motion(vehicle_path=path), observer, seen(AT_NS), PARAMETERS, 0.005, is_hinted
-    )
-    after, _ = velocity.update(VelocityState(offsets=flown), position)
-    assert after.apart_mps == pytest.approx(0.4) and after.is_contradicted == is_hinted
-
-
-@pytest.mark.parametrize(("size", "is_bounded"), [(1.0, False), (100.0, True)])
-def test_offsets_scatter_about_their_line(*, size: float, is_bounded: bool) -> None:
-    """σ² = Σ r² / 3 (n - 2), no more than the noise of a camera system that works."""
-    times_ns = [AT_NS - 500 * MS, AT_NS - 250 * MS, AT_NS]
-    rows = [(-0.20 * size, 0.0, 1.0), (-0.02 * size, 0.0, 1.0), (0.0, 0.0, 1.0)]
-    beside = size * np.array([-0.08, 0.16, -0.08]) / 3.0
-    expected = min(math.sqrt(float(beside @ beside) / 3.0), 0.1)
-    slope = np.array([0.4 * size, 0.0, 0.0])
-    found = velocity._measure_scatter_m(tuple(zip(times_ns, rows, strict=True)), np.array(rows), slope)
-    assert found == pytest.approx(expected)
-    assert (found == 0.1) == is_bounded

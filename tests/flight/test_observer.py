@@ -348,21 +348,3 @@ def test_a_push_is_described_with_and_without_an_attitude() -> None:
     assert describe_push(INITIAL.motion, None, START_NS) == describe_acceleration(INITIAL.motion.push_mps2, None)
     leaning = VehicleMotion(attitude_rad=(0.0, 1.0, 0.0), attitude_ns=START_NS)
     assert describe_push(flown.motion, leaning, START_NS) != describe_push(flown.motion, None, START_NS)
-
-
-@pytest.mark.parametrize(("before_m", "std_m", "factor"), [(0.005, 0.08, 16.0), (0.04, 0.08, 4.0), (0.06, 0.08, 1.0)])
-def test_where_noise_has_grown_positions_before_count_for_less(before_m: float, std_m: float, factor: float) -> None:
-    """P grows as the variance of a position does, from 0.02 m on and by more than half in the deviation."""
-    cov = np.diag([4e-4, 0.01, 0.25])
-    observer = Observer(START_NS, np.zeros((3, 3)), cov, np.zeros(3), std_m=before_m)
-    grown = Observer(START_NS, np.zeros((3, 3)), factor * cov, np.zeros(3), std_m=std_m)
-    found, _ = correct_observer(observer, np.array([0.1, 0.0, 0.0]), std_m)
-    expected, _ = correct_observer(grown, np.array([0.1, 0.0, 0.0]), std_m)
-    np.testing.assert_allclose(found.cov, expected.cov)
-    np.testing.assert_allclose(found.mean, expected.mean)
-    assert found.std_m == std_m
-    first = Observer(START_NS, np.zeros((3, 3)), cov, np.zeros(3))
-    same = Observer(START_NS, np.zeros((3, 3)), cov, np.zeros(3), std_m=std_m)
-    np.testing.assert_allclose(
-        correct_observer(first, np.zeros(3), std_m)[0].cov, correct_observer(same, np.zeros(3), std_m)[0].cov
-    )

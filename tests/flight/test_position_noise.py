@@ -71,52 +71,6 @@ def test_a_jump_and_a_few_outliers_are_no_noise() -> None:
     assert measure_noise(offsets).std_m == 0.0
 
 
-def measure_swings(north_m: list[float], *, step_ns: int = STEP_NS, quiet: int = 15) -> NoiseTrack:
-    """The track of a source that was quiet for so many positions, and then so far north."""
-    offsets = np.zeros((quiet + len(north_m), 3))
-    offsets[quiet:, 0] = north_m
-    return measure_noise(offsets, step_ns=step_ns)
-
-
-@pytest.mark.parametrize("step_ns", [STEP_NS, 4 * STEP_NS])
-def test_noise_that_begins_is_found_by_four_residuals_to_and_fro(step_ns: int) -> None:
-    """Of the last quiet position 3 cm, then 9, 12 and 12 cm, each over √1.5; few count for 1 + 3 (1/4 - 1/15)."""
-    assert measure_swings([0.06, -0.06, 0.06], step_ns=step_ns).std_m == 0.0
-    found = measure_swings([0.06, -0.06, 0.06, -0.06], step_ns=step_ns)
-    assert found.residuals_m == pytest.approx(np.array([0.03, 0.09, 0.12, 0.12]) / math.sqrt(1.5))
-    assert found.std_m == pytest.approx(1.55 * 0.09 / math.sqrt(1.5) / 1.538, rel=1e-9)
-    more = measure_swings([0.06, -0.06, 0.06, -0.06, 0.06], step_ns=step_ns)
-    assert len(more.residuals_m) == 5
-
-
-def test_where_no_noise_is_known_two_residuals_to_and_fro_show_it() -> None:
-    assert measure_swings([0.0, 0.06], quiet=1, step_ns=4 * STEP_NS).std_m == 0.0
-    assert measure_swings([0.0, 0.06, 0.0], quiet=1, step_ns=4 * STEP_NS).std_m > 0.012
-
-
-def test_a_path_that_bends_one_way_a_jump_and_an_outlier_do_not_swing() -> None:
-    bend = [0.05 * n * n for n in range(1, 8)]
-    assert measure_swings(bend).std_m == measure_swings([0.2] * 5).std_m == 0.0
-    assert measure_swings([0.2, 0.0, 0.0, 0.0, 0.0]).std_m == 0.0
-
-
-@pytest.mark.parametrize(("residual_m", "count"), [(0.2499, 1), (0.2501, 0), (0.0185, 1), (0.0184, 0)])
-def test_a_residual_that_swings_is_above_the_usual_noise_and_no_outlier(residual_m: float, count: int) -> None:
-    track = NoiseTrack()
-    for n, down_m in enumerate((0.0, math.sqrt(1.5) * residual_m, 0.0), start=1):
-        track = noise.update(track, make_sample(n * STEP_NS, (0.0, 0.0, down_m)), n * STEP_NS)
-    assert len(track.swings_m) == count
-
-
-@pytest.mark.parametrize(("after_ms", "count"), [(404, 1), (406, 0)])
-def test_positions_far_apart_do_not_swing(after_ms: int, count: int) -> None:
-    """The product of both distances is bounded by 0.081 s²."""
-    track = NoiseTrack()
-    for ms, up_m in ((0, 0.0), (200, 0.2), (200 + after_ms, 0.0)):
-        track = noise.update(track, make_sample(1 + ms * 1_000_000, (0.0, 0.0, up_m)), 1 + ms * 1_000_000)
-    assert len(track.swings_m) == count
-
-
 def test_noise_is_bounded_and_needs_positions_close_to_one_another() -> None:
     rng = np.random.default_rng(3)
     wild = rng.standard_normal((30, 3))

@@ -196,11 +196,11 @@ def _gate_in_order(
             first = frozen.track_sample(sources.tracks, kalman, history, sample, np.zeros(len(kalman.axes)))
             sources = replace(sources, tracks=first)
         sources = replace(sources, jumps=jumps.note_position(sources.jumps, at_ns))
-        corrected, noise_before = _correct_sample(sources, sample, at_ns), sources.noise
+        corrected, knew_noise = _correct_sample(sources, sample, at_ns), sources.noise.is_measured
         if belief is not None:  # else it is the first one, or too old
             sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, corrected, belief)
-            if sources.noise.std_m > (noise.GROWN * noise_before.std_m if noise_before.is_measured else 0.0):
-                # Positions that were taken for better have made a wrong velocity, and doubt of inertial data.
+            if not knew_noise and sources.noise.std_m > 0.0:
+                # The first positions have made a wrong velocity, and doubt of inertial data.
                 history, belief = weaken_samples(history, sources.noise.std_m), None
             if verdict.cause is not None:
                 code = verdict.cause.value

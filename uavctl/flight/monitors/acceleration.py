@@ -4,9 +4,7 @@
 2. Drag explains the part that points against the velocity.
 3. Where inertial data show the same acceleration, it is wind or a hit: a push, and positions are right.
 4. What is left is compared with its bound: for 0.1 s, or at once if it is 1.5 times the bound. Then: end the plans.
-5. Noise of 5 cm that has just begun may look like that, where positions are few. So one position that shows it is not
-   certain: it does not count where the vehicle's own velocity agrees with positions (`uavctl.flight.monitors.engaged`).
-6. Three clipped innovations of the last five: positions scatter. Then: end the plans.
+5. Three clipped innovations of the last five: positions scatter. Then: end the plans.
 
 A frame that is turned, mirrored or in another unit gives the acceleration sent a wrong direction or size. A marker that
 came loose shows none at all.
@@ -38,9 +36,6 @@ PERSISTS_NS = 100_000_000  # time for which it has to last, over two positions a
 IMMEDIATE_RATIO = 1.5  # of the bound: from there on one position is enough
 MIN_SIGMA = 1.5  # it counts from so many of its standard deviations on,
 MIN_SIGMA_NOISY = 4.0  # and from so many where positions are noisier than `USUAL_STD_M`: chance alone makes two of them
-# Noise that may have begun, and standard deviations of it by which no position is off. No noise points the same way for
-# longer than `CERTAIN_NS`.
-NOISY_STD_M, CERTAIN_SIGMA, CERTAIN_NS = 0.05, 8.0, 600_000_000
 HINT_RATIO = 0.4  # of the bound: above it, a difference of velocities counts at once
 CLEAN_RATIO = 0.5  # of the bound: up to it, a position is clean
 # Of the bound: a push that inertial data show explains nothing up to it, and a strong push ends at it.
@@ -57,9 +52,6 @@ class AccelerationState(msgspec.Struct, frozen=True):
     ratio: float = 0.0  # size that nothing explains, over its bound
     clipped: tuple[bool, ...] = ()  # whether each of the last innovations was clipped, newest last
     is_pushed: bool = False  # whether inertial data explain more than the bound
-    is_certain: bool = (
-        True  # whether noise that has just begun does not explain it, whatever the vehicle's own velocity
-    )
     over_ns: int | None = None  # capture time from which it has been beyond its bound [ns]; None while it is not
 
     @property
@@ -86,12 +78,8 @@ def update(state: AccelerationState, observation: PositionObservation) -> tuple[
     sigma = MIN_SIGMA_NOISY if POSITION_STD_M < observation.std_m <= LARGEST_STD_M else MIN_SIGMA
     is_significant = beside_mps2 > sigma * math.sqrt(observer.cov[2, 2])
     over_ns = (state.over_ns or observation.at_ns) if ratio > 1.0 and is_significant else None
-    # |d| > 8 K_d σ with K_d = P_dp / R: more than noise of one position makes
-    noise = max(observation.std_m, POSITION_STD_M) ** 2
-    has_lasted = over_ns is not None and observation.at_ns - over_ns >= CERTAIN_NS
-    is_certain = has_lasted or beside_mps2 > CERTAIN_SIGMA * NOISY_STD_M * float(observer.cov[2, 0]) / noise
     clipped = (*state.clipped, observation.is_clipped)[-CLIPPED_OF:]
-    state = AccelerationState(beside_sent_mps2, ratio, clipped, is_pushed, is_certain, over_ns)
+    state = AccelerationState(beside_sent_mps2, ratio, clipped, is_pushed, over_ns)
     if over_ns is not None and (ratio >= IMMEDIATE_RATIO or observation.at_ns - over_ns >= PERSISTS_NS):
         return state, end_plans(EventCode.RESPONSE, _describe_response(unexplained, observation))
     if sum(clipped) >= CLIPPED_LIMIT:

@@ -30,7 +30,6 @@ from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict
 from uavctl.records import PositionSample, Vec3
 
 # Time of a flight after which positions of another body or frame would have been found.
-AGREES = 0.75  # of the bound: a smaller difference of velocities speaks for positions
 CONFIRMS_NS = 2_000_000_000
 
 
@@ -102,10 +101,6 @@ def _update_with_position(
     if acceleration_state.is_hinted:
         position = replace(position, is_hinted=True)
     velocity_state, contradiction = velocity.update(state.velocity, position)
-    apart_mps, is_doubtful = velocity_state.apart_mps, not acceleration_state.is_certain
-    if response.cause is EventCode.RESPONSE and is_doubtful and apart_mps is not None:
-        # Noise that has just begun explains it, too, as the vehicle's own velocity does not contradict.
-        response = NO_VERDICT if apart_mps <= AGREES * parameters.disagreement_mps else response
     is_clean = acceleration_state.is_clean and velocity_state.agrees(parameters)
     state = replace(
         state,

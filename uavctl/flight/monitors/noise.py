@@ -8,10 +8,6 @@
 3. What the first residuals show holds for the positions before them, too: taken for exact, two positions with noise of
    5 cm make a velocity of metres a second.
 
-4. Noise that grows in flight is found sooner than a median changes: `LEAST_SWINGS` residuals in a row that point to and
-   fro, each larger than the usual noise. A motion bends a path one way for longer, a jump makes two of them. What came
-   before then shows nothing of the noise any more.
-
 Frames that are wrong make smooth errors, which do not change the noise.
 """
 
@@ -36,12 +32,6 @@ _LARGEST_S2 = 0.01
 # The same for three distances and a parabola: 5 m/s³, the most that setpoints change by, make 0.02 m of it. Four
 # positions in a row at 5 Hz are close enough.
 _LARGEST_S3 = 0.025
-# Product of the distances in time of neighbours whose residuals may swing: 0.2 and 0.4 s.
-_LARGEST_SWING_S2 = 0.081
-LEAST_SWINGS = 4
-LARGEST_SWING_M = 0.25  # a larger residual is an outlier
-FIRST_SWINGS = 2  # where no noise is known, nothing speaks against it
-GROWN = 1.5  # noise that swings show replaces what was known of it from so many times on
 _Place = tuple[int, Vec3]  # capture time [ns], position [m]
 _MEDIAN_3D = 1.538  # median length of a vector of three independent values with standard deviation 1
 
@@ -54,7 +44,6 @@ class NoiseTrack(msgspec.Struct, frozen=True):
     # Standard deviation of a position, each axis [m]; 0 where it is not known, or not above `USUAL_STD_M`
     std_m: float = 0.0
 
-    swings_m: tuple[Vec3, ...] = ()  # last residuals that point to and fro, oldest first, scaled alike
     close_count: int = 0  # positions so far that lay close to their neighbours in time, at most as many as are needed
 
     @property
@@ -73,36 +62,11 @@ def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
     if track.last and at_ns <= track.last[-1][0]:
         return track
     last, residuals_m = (*track.last, (at_ns, sample.position_m)), track.residuals_m
-    swings_m = _extend_swings(track.swings_m, last)
     neighbours = _select_neighbours(last, track.is_known)
     if neighbours:
-        residuals_m = (*residuals_m, math.hypot(*_find_residual_m(last[-2], neighbours)))[-_RESIDUALS:]
-    elif len(swings_m) > LEAST_SWINGS:
-        residuals_m = (*residuals_m, math.hypot(*swings_m[-1]))[-_RESIDUALS:]
-    std_m = _estimate_std_m(residuals_m)
-    if len(swings_m) >= (LEAST_SWINGS if len(residuals_m) >= _LEAST_RESIDUALS else FIRST_SWINGS):
-        swinging_m = tuple(math.hypot(*swing_m) for swing_m in swings_m)
-        if std_m * GROWN < median_low(swinging_m) / _MEDIAN_3D:
-            residuals_m = swinging_m
-            std_m = _estimate_std_m(residuals_m)
+        residuals_m = (*residuals_m, _find_residual_m(last[-2], neighbours))[-_RESIDUALS:]
     close_count = min(track.close_count + (len(neighbours) == 2), _LEAST_RESIDUALS)
-    return NoiseTrack(last[-3:], residuals_m, std_m, swings_m, close_count)
-
-
-def _extend_swings(swings_m: tuple[Vec3, ...], last: Sequence[_Place]) -> tuple[Vec3, ...]:
-    """Add the residual of the last position but one to those that point to and fro, or begin them anew."""
-    if len(last) < 3:
-        return ()
-    neighbours = last[-3], last[-1]
-    if -math.prod((at_ns - last[-2][0]) * 1e-9 for at_ns, _ in neighbours) > _LARGEST_SWING_S2:
-        return ()
-    swing_m = _find_residual_m(last[-2], neighbours)
-    if not _MEDIAN_3D * USUAL_STD_M < math.hypot(*swing_m) <= LARGEST_SWING_M:
-        return ()
-    # r_0' r < 0
-    if swings_m and sum(map(math.prod, zip(swings_m[-1], swing_m, strict=True))) < 0.0:
-        return (*swings_m, swing_m)[-_RESIDUALS:]
-    return (swing_m,)
+    return NoiseTrack(last[-3:], residuals_m, _estimate_std_m(residuals_m), close_count)
 
 
 def _select_neighbours(last: Sequence[_Place], is_known: bool) -> Sequence[_Place]:
@@ -116,16 +80,15 @@ def _select_neighbours(last: Sequence[_Place], is_known: bool) -> Sequence[_Plac
     return others if len(others) == 3 and not is_known and math.prod(times_s) <= _LARGEST_S3 else ()
 
 
-def _find_residual_m(middle: _Place, others: Sequence[_Place]) -> Vec3:
-    """Find how far (3,) a position is off the line, or the parabola, through others, scaled to the noise of one [m]."""
+def _find_residual_m(middle: _Place, others: Sequence[_Place]) -> float:
+    """Find how far a position is off the line, or the parabola, through others, scaled to the noise of one [m]."""
     (middle_ns, middle_m) = middle
     times_ns = [at_ns - middle_ns for at_ns, _ in others]
     # r = p - Σ c_i p_i with c_i = Π_j t_j / (t_j - t_i), whose variance is (1 + Σ c_i²) σ²
     parts = [math.prod(t / (t - own) for t in times_ns if t != own) for own in times_ns]
     columns = zip(middle_m, *(place for _, place in others), strict=True)
-    scale = 1.0 / math.sqrt(1.0 + sum(part * part for part in parts))
-    north, east, down = (scale * (m - sum(map(math.prod, zip(parts, places, strict=True)))) for m, *places in columns)
-    return north, east, down
+    away_m = [m - sum(map(math.prod, zip(parts, places, strict=True))) for m, *places in columns]
+    return math.hypot(*away_m) / math.sqrt(1.0 + sum(part * part for part in parts))
 
 
 def _estimate_std_m(residuals_m: Sequence[float]) -> float:

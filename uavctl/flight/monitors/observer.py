@@ -1,8 +1,7 @@
 """Observer of positions: the acceleration that they show and that neither setpoints nor inertial data explain.
 
 1. State of each axis: position p, velocity v, unexplained acceleration d. Setpoints drive it, behind the vehicle's lag.
-2. Positions correct it. An innovation counts up to six standard deviations. Where noise has grown, positions before
-   count for less, too.
+2. Positions correct it. An innovation counts up to six standard deviations.
 3. A second mean is driven by the vehicle's inertial data instead of setpoints.
 
 An accelerometer shows all forces but gravity, so it shows drag. In wind, inertial data and positions show the same
@@ -22,7 +21,6 @@ from operator import attrgetter, itemgetter
 
 import msgspec
 import numpy as np
-from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.flight.limits import ZERO
@@ -31,7 +29,6 @@ from uavctl.records import Vec3
 DRAG_1PS = 1.2  # most drag that is taken for drag: PX4's simulated vehicles have 1.0
 CLIP_SIGMA = 6.0  # an innovation counts up to so many standard deviations: one reflection is no proof
 POSITION_STD_M = 0.02  # least standard deviation of a position: the gate and rounding may leave so much
-GROWN = 1.5  # times the noise so far: then positions before were taken for better than they are
 MIN_LAG_S = 1e-3  # for a plant without a lag
 _BEGIN = attrgetter("at_ns")
 _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
@@ -68,7 +65,6 @@ class Observer(msgspec.Struct, frozen=True, eq=False):
     accel_mps2: Array  # acceleration that the setpoints so far give the vehicle, behind its lag (3,)
     # The same as `mean`, driven by inertial data in place of setpoints; None before any
     inertial: Array | None = None
-    std_m: float = 0.0  # standard deviation with which its last position counted
 
 
 def extend_path(path: InertialPath, begin_ns: int, accel_mps2: Sequence[float], horizon_ns: int) -> InertialPath:
@@ -124,7 +120,7 @@ def predict_observer(
         if inertial is None:  # inertial data have just begun: from here on they explain all of it
             inertial = np.array([observer.mean[0], observer.mean[1], np.zeros(3)])
         inertial = move_along(path, inertial, observer.at_ns, at_ns)
-    return Observer(at_ns=at_ns, mean=mean, cov=cov, accel_mps2=accel, inertial=inertial, std_m=observer.std_m)
+    return Observer(at_ns=at_ns, mean=mean, cov=cov, accel_mps2=accel, inertial=inertial)
 
 
 def _follow_setpoints(
@@ -167,10 +163,6 @@ def _split_spans(
 def correct_observer(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
     """Correct by a position; return too whether its innovation was beyond the bound, whatever drives the observer."""
     noise = max(std_m, POSITION_STD_M) ** 2
-    before = max(observer.std_m, POSITION_STD_M) ** 2
-    if observer.std_m > 0.0 and noise > GROWN**2 * before:
-        # Positions before it were as noisy: P = P R / R_0
-        observer = replace(observer, cov=observer.cov * (noise / before))
     # S = P_pp + R; K = P H' / S
     variance = float(observer.cov[0, 0]) + noise
     bound = CLIP_SIGMA * math.sqrt(variance)
@@ -184,7 +176,7 @@ def correct_observer(observer: Observer, position: Array, std_m: float) -> tuple
     if inertial is not None:
         inertial, is_far = _correct_mean(inertial, position, gain, bound)
         is_clipped = is_clipped and is_far
-    return Observer(observer.at_ns, mean, cov, observer.accel_mps2, inertial, std_m), is_clipped
+    return Observer(observer.at_ns, mean, cov, observer.accel_mps2, inertial), is_clipped
 
 
 def _correct_mean(mean: Array, position: Array, gain: Array, bound: float) -> tuple[Array, bool]:

@@ -2,8 +2,7 @@
 
 1. At each position the offset is noted: the position minus the distance by the vehicle's own velocity.
 2. The slope of the offsets over a second or so is the difference of both velocities. Stamps that are late explain a
-   part that is the acceleration times the delay. What is left is compared with its bound. Then: end the plans. The
-   bound includes the slope that noise makes: as measured, or as these offsets scatter about their line.
+   part that is the acceleration times the delay. What is left is compared with its bound. Then: end the plans.
 3. The mean offsets of half a minute show a frame that creeps: their change is compared with a bound that grows with
    time. Smoothing in a camera system explains a part: one delay for all, times the change of the velocity. Then: end
    the plans.
@@ -30,7 +29,7 @@ from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import PositionObservation, TickObservation, find_distance
-from uavctl.flight.monitors.noise import LARGEST_STD_M, USUAL_STD_M
+from uavctl.flight.monitors.noise import USUAL_STD_M
 from uavctl.flight.monitors.observation import EnvelopeParameters, describe_vector
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vector
@@ -108,10 +107,7 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
         drift, places, aligned = _find_drift(state, offsets, points, velocity, parameters)
     apart = _remove_delay(slope, begin, middle, end, span_s)
     apart_mps = math.hypot(*apart)
-    std_m = observation.std_m
-    if not observation.is_hinted:
-        std_m = max(std_m, _measure_scatter_m(offsets, points, slope))
-    bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, std_m)
+    bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, observation.std_m)
     is_contradicted = apart_mps > bound_mps
     apart_ns = (state.apart_ns or at_ns) if is_contradicted and not corrects else None
     state = VelocityState(offsets, places, aligned, apart_mps, is_contradicted, apart_ns)
@@ -271,15 +267,6 @@ def _fit_slope(offsets: Offsets, points: Array, parameters: EnvelopeParameters) 
     centred = times_s - np.add.reduce(times_s) / len(times_s)
     slope: Array = centred.dot(points) / float(centred.dot(centred))
     return slope
-
-
-def _measure_scatter_m(offsets: Offsets, points: Array, slope: Array) -> float:
-    """Measure the standard deviation [m] of offsets about their line: noise that has just begun shows there first."""
-    times_s = np.array([(at_ns - offsets[0][0]) * 1e-9 for at_ns, _ in offsets])
-    centred = times_s - np.add.reduce(times_s) / len(times_s)
-    beside = points - np.add.reduce(points, axis=0) / len(points) - np.outer(centred, slope)
-    # σ² = Σ |o_i - ō - v t_i|² / 3 (n - 2)
-    return min(math.sqrt(float(np.vdot(beside, beside)) / (3.0 * (len(offsets) - 2))), LARGEST_STD_M)
 
 
 def _bound_noise_mps(offsets: Offsets, std_m: float) -> float:
