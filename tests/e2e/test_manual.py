@@ -26,7 +26,7 @@ VALUES = {
 # What is typed otherwise so that all of it takes minutes, not hours: (pattern, in its place).
 SHORTENED = (
     (r"--runs 200(000)?\b", "--runs 2"),
-    (r"^(uavctl campaign docs/campaigns/\w+\.toml)(?!.*--runs)", r"\1 --runs 2"),
+    (r"^(uavctl campaign docs/campaigns/[\w-]+\.toml)(?!.*--runs)", r"\1 --runs 2"),
     (r"^(uavctl paper)(?!.*--runs)", r"\1 --runs 2 --steps 20"),
     (r"^(uavctl loopback (?!.*--(duration|goto)))", r"\1--duration 8 "),
     (r"^(uavctl loopback .*)--duration 20", r"\1--duration 8"),
