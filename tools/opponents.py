@@ -66,15 +66,16 @@ class LqrByAge(Lqg):
         return np.asarray(deviation @ self._k.T)
 
 
-def find_shape(problem: ControlProblem, newest: Counts) -> Array:
-    """Find the distances of the ages (n,) on a link as drawn, the largest of them 1."""
+def find_shape(newest: Counts) -> Array:
+    """Find the distances of the ages (n,) from one wall on a link as drawn, the largest of them 1."""
     ages = np.minimum(np.arange(newest.shape[1]) - newest, HORIZON - 1)[:, SETTLED:]
     shares = np.bincount(ages.ravel(), minlength=HORIZON).astype(float)
     # A position that is late is never young; from the most frequent age on, shares fall
     youngest = int(shares.argmax())
     shares = np.minimum.accumulate(shares[youngest:])
-    (row,) = np.flatnonzero(problem.state_set.c[:, 0] > 0.0)
-    distances = find_distances(make_problem(1), np.maximum(shares, 1e-12), int(row), ALLOWED)
+    problem = make_problem(1)
+    (wall,) = np.flatnonzero(problem.state_set.c[:, 0] > 0.0)
+    distances = find_distances(problem, np.maximum(shares, 1e-12), int(wall), ALLOWED)
     return np.asarray(np.concatenate([np.full(youngest, distances[0]), distances]) / distances.max())
 
 
@@ -130,7 +131,7 @@ def find_reference(
         The distance, and how the ages share it, see `find_shape`.
     """
     drawn = draw_runs(cell, problem, steps, TUNING_SEED, TUNING_RUNS)
-    shape = find_shape(problem, drawn[0])
+    shape = find_shape(drawn[0])
     low, high = NEAREST_M, FURTHEST_M
     for _ in range(HALVINGS):
         middle = math.sqrt(low * high)

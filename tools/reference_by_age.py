@@ -32,7 +32,6 @@ from uavctl.arrays import Array
 from uavctl.smpc.nominal import ControlProblem, lqr, propagate_covariance
 
 RARE = 2e-3  # share of time of an age below which it keeps the distance of the last one above
-FIXED_POINT_STEPS = 300
 
 
 def find_distances(problem: ControlProblem, shares: Array, row: int, allowed: float) -> Array:
@@ -69,10 +68,13 @@ def find_distances(problem: ControlProblem, shares: Array, row: int, allowed: fl
 
     # X = Σ_t g_{t-1} (M^t X M^t' + Σ_t),  s_t² = c'(M^t X M^t' + Σ_t) c
     covs = propagate_covariance(plant, count)[1 : count + 1]
-    settled = np.zeros((n_x, n_x))
-    for _ in range(FIXED_POINT_STEPS):
-        settled = np.einsum("t,tij->ij", gaps, powers[1:] @ settled @ powers[1:].transpose(0, 2, 1) + covs)
-    all_covs = powers[1:] @ settled @ powers[1:].transpose(0, 2, 1) + covs
+    closed_loops = powers[1:]
+    # vec(X) = (I - Σ_t g_{t-1} M^t ⊗ M^t)⁻¹ vec(Σ_t g_{t-1} Σ_t)
+    feedback = np.eye(n_x * n_x) - sum(
+        gap * np.kron(power, power) for gap, power in zip(gaps, closed_loops, strict=True)
+    )
+    settled = np.linalg.solve(feedback, np.einsum("t,tij->ij", gaps, covs).ravel()).reshape(n_x, n_x)
+    all_covs = closed_loops @ settled @ closed_loops.transpose(0, 2, 1) + covs
     deviations = np.sqrt(np.einsum("i,tij,j->t", c, all_covs, c))
 
     # Σ_j π_j (w_j'Q_x w_j + u_j'Q_u u_j),  u_j = K (w_j - x_s(d_j))
@@ -82,9 +84,7 @@ def find_distances(problem: ControlProblem, shares: Array, row: int, allowed: fl
     # + Σ_j g_j δ_j' Z δ_j,  Z = S + Σ_j g_j M^{j+1}' Z M^{j+1}
     stage = problem.q_x + law.k.T @ problem.q_u @ law.k
     direct = np.einsum("j,jki,kl,jlm->im", shares, powers[:-1], stage, powers[:-1])
-    price = direct
-    for _ in range(FIXED_POINT_STEPS):
-        price = direct + np.einsum("j,jki,kl,jlm->im", gaps, powers[1:], price, powers[1:])
+    price = np.linalg.solve(feedback.T, direct.ravel()).reshape(n_x, n_x)
     change = after - start
     cost += np.einsum("j,jin,ik,jkm->nm", gaps, change, price, change)
 

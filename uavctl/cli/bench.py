@@ -34,7 +34,7 @@ def bench(
 ) -> int:
     """Measure how long one decision and one tick take on this machine, beside the printed problem and the last run."""
     loaded = common.load()
-    before = None if last is None else read_bench(last)
+    before = None if last is None else read_bench(last, loaded.config.name)
     options = ["--config", common.config]
     for override in common.overrides:
         options += ["--set", override]
@@ -50,16 +50,21 @@ def bench(
     return 0
 
 
-def read_bench(path: Path) -> Bench:
-    """Read the document of an earlier run.
+def read_bench(path: Path, config_name: str) -> Bench:
+    """Read the document of an earlier run of the same configuration.
 
     Raises:
-        UavctlError: The file cannot be read, or holds another document.
+        UavctlError: The file cannot be read, or holds another document, or a run of another configuration.
     """
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Bench)
+        before = msgspec.json.decode(path.read_bytes(), type=Bench)
     except (OSError, msgspec.MsgspecError) as error:
         raise UavctlError(f"{path} holds no run of a bench: {error}; write one by `uavctl bench --json`") from error
+    if before.config != config_name:
+        raise UavctlError(
+            f"{path} is a run of {before.config}, not of {config_name}; give one of the same configuration"
+        )
+    return before
 
 
 def render_bench(result: Bench, before: Bench | None = None) -> RenderableType:

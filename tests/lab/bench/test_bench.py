@@ -104,7 +104,7 @@ def test_figures_are_compared_with_those_of_the_last_run(tmp_path: Path) -> None
     file.write_bytes(msgspec.json.encode({"schema": "uavctl/bench/2", **msgspec.to_builtins(make_bench(200.0))}))
     shown = StringIO()
     console = Console(width=150, file=shown)
-    console.print(render_bench(make_bench(500.0), read_bench(file)))
+    console.print(render_bench(make_bench(500.0), read_bench(file, make_bench(500.0).config)))
     text = shown.getvalue()
     assert text.count("2.50") == 4 and "8 times" in text
 
@@ -115,6 +115,13 @@ def test_another_document_is_refused(content: str, tmp_path: Path, capsys: pytes
     file.write_text(content)
     assert run(["bench", "--last", str(file)]) == 1
     assert str(file) in capsys.readouterr().err
+
+
+def test_a_run_of_another_configuration_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "last.json"
+    file.write_bytes(msgspec.json.encode(make_bench(500.0)))
+    with pytest.raises(UavctlError, match="another-room"):
+        read_bench(file, "another-room")
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ class LinkSpec(Section, frozen=True, kw_only=True):
     """One link."""
 
     name: Name
-    set: Annotated[Overrides, declare("overrides of the configuration's", "link")] = ()
+    set: Annotated[Overrides, declare("overrides of the configuration's [link]")] = ()
 
 
 class DisturbanceSpec(Section, frozen=True, kw_only=True):
@@ -132,7 +132,7 @@ class PlantSpec(Section, frozen=True, kw_only=True):
     """One plant that is flown; the controllers go on believing in the configuration's."""
 
     name: Name
-    set: Annotated[Overrides, declare("overrides of the configuration's", "plant")] = ()
+    set: Annotated[Overrides, declare("overrides of the configuration's [plant]")] = ()
 
 
 class TuningSpec(Section, frozen=True, kw_only=True):
