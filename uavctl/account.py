@@ -9,6 +9,7 @@ Pure: nothing here decides anything.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from msgspec.structs import replace
@@ -63,6 +64,12 @@ def report_lost_records(ending: Ending, records: int, reason: str) -> Ending:
 def report_failed_writes(ending: Ending, reason: str) -> Ending:
     """Return the ending of a flight whose recording is complete, but could not be written as it should."""
     text = f"{ending.sentence.removesuffix('.')}; writing the recording failed ({reason}), and no record is lost."
+    return replace(ending, as_ordered=False, exit_code=ending.exit_code or 1, sentence=text)
+
+
+def report_missing_files(ending: Ending, names: Sequence[str]) -> Ending:
+    """Return the ending of a flight of whose recording files were deleted or moved."""
+    text = f"{ending.sentence.removesuffix('.')}; of the recording {', '.join(names)} was deleted or moved."
     return replace(ending, as_ordered=False, exit_code=ending.exit_code or 1, sentence=text)
 
 

@@ -14,7 +14,7 @@ from logs.recording.disk import check_file_limit, check_free_space
 from logs.recording.output_files import remove_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER
-from uavctl.account import report_failed_writes, report_lost_records
+from uavctl.account import report_failed_writes, report_lost_records, report_missing_files
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
 from uavctl.config.types import LogConfig
@@ -77,9 +77,16 @@ def put_header(
 def describe_ending(ending: Ending, status: RecorderStatus) -> Ending:
     """Return how a flight ended, with the state of its recording."""
     reason = status.reason or status.refusal or "the disk was too slow"
+    if missing_files := find_missing_files(status):
+        return report_missing_files(ending, missing_files)
     if not status.ok:
         return report_lost_records(ending, max(count_missing_records(status), 1), reason)
     return report_failed_writes(ending, reason) if status.failures else ending
+
+
+def find_missing_files(status: RecorderStatus) -> tuple[str, ...]:
+    """Return the files of the recording that are no longer where they were made."""
+    return tuple(name for name in status.segments if not Path(name).exists())
 
 
 def count_missing_records(status: RecorderStatus) -> int:

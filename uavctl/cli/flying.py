@@ -15,7 +15,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from msgspec.structs import replace
 
-from logs.recording.ends import count_missing_records, describe_ending
+from logs.recording.ends import count_missing_records, describe_ending, find_missing_files
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
 from logs.recording.recorder import DerivedTopics, RecorderStatus
@@ -238,12 +238,14 @@ def print_losses(status: RecorderStatus) -> None:
     """Print after a flight what the recording lacks, and why."""
     if status.failures or not status.ok:
         missing = count_missing_records(status)
+        missing_files = find_missing_files(status)
         loss = f"the recording lacks {missing} records" if missing else "a write of the recording failed"
         print_message(
             label_text(
                 "warning",
                 f"{loss} ({status.reason or status.refusal or 'the disk was too slow'}); what is in it is whole. "
-                f"Files: {', '.join(status.segments) or 'none'}",
+                f"Files: {', '.join(name for name in status.segments if name not in missing_files) or 'none'}"
+                + (f". Deleted or moved: {', '.join(missing_files)}" if missing_files else ""),
                 "bold red",
             )
         )

@@ -12,9 +12,12 @@ from patience import wait_until
 from recording_fakes import Clock, drop_recorder_notes, flight
 
 from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.ends import describe_ending, find_missing_files
 from logs.recording.info import read_info
 from logs.recording.reader import find_segments, read
 from logs.recording.recorder import LATE_S, Recorder, SyncRecorder
+from uavctl.account import make_ending
+from uavctl.cause import Cause
 from uavctl.cli.services import make_recorder_health
 from uavctl.config.types import LogConfig
 
@@ -142,6 +145,9 @@ def test_a_file_that_is_taken_away_is_reported_and_another_one_begun(
     assert not any(is_in_trouble[225:])  # the next file is written
     final = recorder.close()
     assert final.failures == 1 and "deleted or moved" in final.reason
+    assert find_missing_files(final) == (str(path),)
+    ending = describe_ending(make_ending(Cause.ENDED_IN_AIR, ""), final)
+    assert str(path) in ending.sentence and "lost" not in ending.sentence and ending.exit_code == 1
     later = path.with_name("flight-2.mcap")
     assert find_segments(path) == (later,)
     kept = drop_recorder_notes(list(read(path)))[1:]  # its header is the flight's
