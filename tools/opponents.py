@@ -4,7 +4,7 @@
    the plan aims at a reference further from the wall than the target. The cap is the reference's distance.
 2. `lqr`: the regulator on the predicted mean, aimed at such a reference and clipped by the actuators.
 3. `lqr-by-age`: the same with a reference that is further away the older the information is. How the distances differ
-   follows from the ages of the link that they are tuned on, see `tools/reference_by_age.py`.
+   follows from the ages of the link that they are tuned on, see `uavctl.smpc.conditioned.reference`.
 
 All are judged by the cost to the target, as the scheme is. The reference is the nearest to the wall that is outside in
 at most `--outside` of the steps after the first 200, found by halving on runs of another seed: on the link itself, and
@@ -21,14 +21,15 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from other_links import ALLOWED, CELLS, HORIZON, SETTLED, WALL_M, Cell, draw_run, make_problem
-from reference_by_age import find_distances
+from other_links import ALLOWED, CELLS, SETTLED, WALL_M, Cell, draw_run, make_problem
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.world import LinearWorld, simulate
 from uavctl.smpc.baselines import Lqg, PacketisedPredictive
 from uavctl.smpc.batch import BatchController, Counts, Information, predict
-from uavctl.smpc.nominal import BatchMpc, ControlProblem, propagate_covariance, row_deviations
+from uavctl.smpc.conditioned.reference import COUNTED_HORIZONS, ReferenceProgram
+from uavctl.smpc.nominal import BatchMpc, ControlProblem, find_parts, lqr, propagate_covariance, row_deviations
+from uavctl.smpc.sets import find_equilibria
 
 NEAREST_M, FURTHEST_M, HALVINGS = 0.5, 60.0, 8
 TUNING_SEED, TUNING_RUNS = 77, 12
@@ -66,16 +67,26 @@ class LqrByAge(Lqg):
         return np.asarray(deviation @ self._k.T)
 
 
+def make_reference_program() -> ReferenceProgram:
+    """Make the program of the wall in one axis."""
+    problem = make_problem(1)
+    plant, (part,) = problem.plant, find_parts(problem)
+    positions = np.array(plant.position_index, dtype=np.intp)
+    equilibria = find_equilibria(plant.a, plant.b, problem.q_x, problem.q_u, positions)
+    (wall,) = np.flatnonzero(problem.state_set.c[:, 0] > 0.0)
+    error_covs = propagate_covariance(plant, COUNTED_HORIZONS * problem.horizon)
+    law = lqr(plant, problem.q_x, problem.q_u)
+    return ReferenceProgram(problem, law, part, equilibria, problem.state_set.c[wall], error_covs)
+
+
 def find_shape(newest: Counts) -> Array:
     """Find the distances of the ages (n,) from one wall on a link as drawn, the largest of them 1."""
-    ages = np.minimum(np.arange(newest.shape[1]) - newest, HORIZON - 1)[:, SETTLED:]
-    shares = np.bincount(ages.ravel(), minlength=HORIZON).astype(float)
-    # A position that is late is never young; from the most frequent age on, shares fall
-    youngest = int(shares.argmax())
-    shares = np.minimum.accumulate(shares[youngest:])
-    problem = make_problem(1)
-    (wall,) = np.flatnonzero(problem.state_set.c[:, 0] > 0.0)
-    distances = find_distances(problem, np.maximum(shares, 1e-12), int(wall), ALLOWED)
+    ages = (np.arange(newest.shape[1]) - newest)[:, SETTLED:]
+    counts = np.bincount(ages.ravel()).astype(float)
+    # A position that is late is never young; the most frequent age is that of a new one.
+    youngest = int(counts.argmax())
+    positions, runs, further = counts[youngest], counts[youngest + 1], counts[youngest + 2 :].sum()
+    distances = make_reference_program().find_distances((runs / positions, further / (runs + further)), ALLOWED)
     return np.asarray(np.concatenate([np.full(youngest, distances[0]), distances]) / distances.max())
 
 

@@ -427,11 +427,11 @@ class RiskRecord(Record, frozen=True, kw_only=True):
     age: int  # age of the information that moved the vehicle here [steps], from 1 on
     # Probability that the vehicle is outside of its limits, given all that is known; None while it is not flown
     outside: float | None
-    level: int  # level of the budgets; 0: the certificate, which holds on any link
-    contradicts: bool  # whether the link as observed contradicts the configured one
+    # Level of the budgets: 0, the certificate, which holds on any link, or that of an observed link. Recordings up to
+    # version 0.3 have other levels, and a factor `scale` of the deviations
+    level: int
     widening: float  # factor of all standard deviations, by the risk as observed
     silence_widening: float  # further factor of those at the end of a plan, for silences that outlast it
-    scale: float = 1.0  # further factor of all of them, by the link as observed
     spread: float = 1.0  # how far positions are from their predictions, over what the filter expects
 
 

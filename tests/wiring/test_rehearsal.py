@@ -38,7 +38,7 @@ def make_eight(preset: str, *overrides: str) -> Config:
 
 
 def test_long_bursts_relax_most_plans_in_rehearsal_and_flight() -> None:
-    config = load_config("room", (*LONG, "duration_s=12"))
+    config = load_config("room", (*LONG, "duration_s=12", "risk.budgets=configured"))
     result = rehearse_preset(config)
     assert result.relaxes
     assert result.constraint.endswith("velocity")

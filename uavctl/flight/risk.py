@@ -21,14 +21,8 @@ from uavctl.flight.risk_state import RiskGroup, RiskParameters
 from uavctl.flight.supervise import Supervised
 from uavctl.records import Event, Plan, RiskRecord, Severity
 from uavctl.smpc.answer import CONFIGURED_LEVEL, Preview
-from uavctl.smpc.conditioned.adaptation import (
-    AgeRecord,
-    LoopState,
-    charge_risk,
-    combine_widenings,
-    compute_outside_risk,
-    count_age,
-)
+from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_observed_level
 
 # The first positions of a source do not show its clock yet: a few round trips take two seconds, and the smallest delay
 # shows itself within as much.
@@ -44,14 +38,18 @@ def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | Non
     """
     if parameters is None:
         return preview
-    level, scale = CONFIGURED_LEVEL, 1.0
-    if not is_led:
-        rank = risk.ages.rank if parameters.budgets == "observed" else 0
-        level, scale = parameters.choice.levels[rank], parameters.choice.scales[rank]
+    level = CONFIGURED_LEVEL if is_led else _select_level(risk.ages, parameters)
     if not parameters.adapts:
-        return msgspec.structs.replace(preview, level=level, widening=scale)
-    widening = combine_widenings(scale, risk.loop)
-    return msgspec.structs.replace(preview, level=level, widening=widening, silence_widening=risk.loop.silence_widening)
+        return msgspec.structs.replace(preview, level=level)
+    widening, silence_widening = risk.loop.widening, risk.loop.silence_widening
+    return msgspec.structs.replace(preview, level=level, widening=widening, silence_widening=silence_widening)
+
+
+def _select_level(ages: AgeRecord, parameters: RiskParameters) -> int:
+    """Select the level of the budgets: the certificate's, until there is a record that may be used."""
+    if parameters.budgets != "observed" or ages.link is None:
+        return CERTIFICATE_LEVEL
+    return get_observed_level(ages.link)
 
 
 def update_risk(
@@ -81,7 +79,7 @@ def update_risk(
         return RiskGroup(risk.renewed, risk.loop, age_steps, first_ns, risk.renewed), None
     age = before + 1
     if not is_flown:
-        ages = count_age(risk.ages, age, parameters.choice)
+        ages = count_age(risk.ages, age, parameters.prior)
         renewed = ages if age_steps <= before else risk.renewed
         return RiskGroup(ages, risk.loop, age_steps, first_ns, renewed), _make_record(
             age, None, ages, risk.loop, parameters, spread
@@ -122,10 +120,10 @@ def charge_step(
     """
     assert risk.age_steps is not None, "no position came before"
     age = risk.age_steps + 1
-    ages = count_age(risk.ages, age, parameters.choice)
+    ages = count_age(risk.ages, age, parameters.prior)
     outside = compute_outside_risk(margins, variances, spread)
     loop = charge_risk(
-        risk.loop, outside, parameters.choice.allowed, keeps_away=keeps_away, is_behind_horizon=age_steps >= horizon
+        risk.loop, outside, parameters.prior.allowed, keeps_away=keeps_away, is_behind_horizon=age_steps >= horizon
     )
     renewed = ages if age_steps <= risk.age_steps else risk.renewed
     return RiskGroup(ages, loop, age_steps, risk.first_ns, renewed), outside
@@ -142,9 +140,7 @@ def _make_record(
     """Make the record of a step."""
     return RiskRecord(
         age=age,
-        level=parameters.choice.levels[ages.rank],
-        scale=parameters.choice.scales[ages.rank],
-        contradicts=ages.contradicts,
+        level=_select_level(ages, parameters),
         outside=outside,
         spread=spread,
         widening=loop.widening,

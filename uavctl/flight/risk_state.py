@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import msgspec
 
 from uavctl.arrays import Array
-from uavctl.smpc.conditioned.adaptation import AgeRecord, BudgetChoice, LoopState
+from uavctl.smpc.conditioned.adaptation import AgePrior, AgeRecord, LoopState
 
 
 @dataclass(frozen=True, eq=False)
 class RiskParameters:
     """Parameters of the risk in flight."""
 
-    choice: BudgetChoice  # budgets to choose from
+    prior: AgePrior  # configured link, and the allowed risk
     rows: Array  # state rows C (m, n_x)
     budgets: str  # `certificate`, or `observed`: they follow the link
     adapts: bool  # whether the deviations follow the risk as observed

@@ -233,6 +233,23 @@ class TracedAges:
         return float(missing.mean())
 
 
+@dataclass(frozen=True)
+class RunLengthAges:
+    """Ages on a link whose runs of losses begin and go on with two probabilities."""
+
+    first_loss: float  # p, after a position that arrived
+    continuation: float  # ρ, after a loss
+    begins: int = 0  # age of a new position [steps]
+
+    def outage(self, steps: int) -> float:
+        """See `AgeModel`."""
+        # P(a >= b + n) = p ρ^(n-1) / (1 - ρ + p), n > 0
+        lost = steps - self.begins
+        if lost <= 0:
+            return 1.0
+        return self.first_loss * self.continuation ** (lost - 1) / (1.0 - self.continuation + self.first_loss)
+
+
 def bernoulli(p: Array) -> Arrivals:
     """Make a link of independent losses with probabilities known ahead: the paper's.
 

@@ -29,7 +29,7 @@ from uavctl.flight.yaw import YawMode, YawParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conditioned.design import AnyDesign, ConditionedDesign, make_conditioned_id, make_conditioned_record
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_age_prior
 from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
@@ -388,8 +388,8 @@ def _build_risk(config: Config, design: AnyDesign) -> RiskParameters | None:
     risk = config.risk
     if not isinstance(design, ConditionedDesign) or risk.budgets == "configured":
         return None
-    choice = make_budget_choice(design.solver, 1.0 - config.smpc.delta_x)
-    return RiskParameters(choice, design.state_set.c, risk.budgets, risk.adapt)
+    prior = make_age_prior(design.solver, 1.0 - config.smpc.delta_x)
+    return RiskParameters(prior, design.state_set.c, risk.budgets, risk.adapt)
 
 
 def build_controller(config: Config, design: AnyDesign | None = None) -> Controller:

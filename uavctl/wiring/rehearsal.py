@@ -20,8 +20,11 @@ from uavctl.arrays import Array
 from uavctl.config.types import Config
 from uavctl.flight.controller import Controller
 from uavctl.flight.mission import Mission, advance_mission, make_question
+from uavctl.flight.risk import set_risk
+from uavctl.flight.risk_state import RiskGroup
 from uavctl.records import Vector
 from uavctl.smpc.answer import Preview
+from uavctl.smpc.conditioned.adaptation import AgeRecord, find_prior_link
 from uavctl.smpc.conditioned.design import ConditionedDesign
 from uavctl.smpc.plant import AXES, Plant
 from uavctl.wiring.controller import build_plant, make_start_state
@@ -147,6 +150,7 @@ def _fly_mission(
     motion, index = mission.trajectory, list(plant.position_index)
     x = make_rehearsal_start(config, design, mission)
     late_steps = _sample_late_steps(config, design)
+    risk = RiskGroup() if controller.risk is None else RiskGroup(AgeRecord(link=find_prior_link(controller.risk.prior)))
     steps = min(MAX_STEPS, round(config.duration_s / plant.dt_s) if motion is None else len(motion.states))
     last_input, state = np.zeros(plant.n_u), None
     worst, ahead_s, relaxed = ("", "", 0.0), 0.0, 0
@@ -158,6 +162,7 @@ def _fly_mission(
         request = Preview(
             limits=preview.limits, path=preview.path, age=age_steps, cov=design.estimate_cov, sent=last_input
         )
+        request = set_risk(request, risk, controller.risk, is_led=False)
         answer = design.solver.solve(k, x, target, request)
         positions_m.append(x[index])
         relaxed += bool(answer.relaxed)

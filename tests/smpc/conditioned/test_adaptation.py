@@ -1,4 +1,4 @@
-"""Certificate, levels and loop: the risk follows the link and the disturbances as observed."""
+"""Certificate, link and loop: the risk follows the link and the disturbances as observed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from uavctl.arrays import Array
 from uavctl.config.load import load_config
-from uavctl.smpc.answer import Preview
+from uavctl.smpc.answer import Preview, QuestionError
 from uavctl.smpc.conditioned import adaptation
-from uavctl.smpc.conditioned.adaptation import AgeRecord, BudgetChoice, LoopState, charge_risk, count_age
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
+from uavctl.smpc.conditioned.adaptation import AgePrior, AgeRecord, LoopState, charge_risk, count_age
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_age_prior
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_link, get_observed_level
 from uavctl.smpc.link import bernoulli
 from uavctl.wiring.controller import build_problem
 
@@ -30,8 +30,8 @@ def solver() -> ConditionedSolver:
 
 
 @pytest.fixture(scope="module")
-def choice(solver: ConditionedSolver) -> BudgetChoice:
-    return make_budget_choice(solver, ALLOWED)
+def prior(solver: ConditionedSolver) -> AgePrior:
+    return make_age_prior(solver, ALLOWED)
 
 
 def draw_ages(steps: int, loss: float, burst: float, seed: int) -> list[int]:
@@ -46,94 +46,66 @@ def draw_ages(steps: int, loss: float, burst: float, seed: int) -> list[int]:
     return ages
 
 
-def record_ages(ages: list[int], choice: BudgetChoice, record: AgeRecord | None = None) -> AgeRecord:
+def record_ages(ages: list[int], prior: AgePrior, record: AgeRecord | None = None) -> AgeRecord:
     record = record or AgeRecord()
     for age in ages:
-        record = count_age(record, age, choice)
+        record = count_age(record, age, prior)
     return record
 
 
-def test_the_certificate_keeps_the_allowed_risk_on_any_link(choice: BudgetChoice) -> None:
-    for shares in np.random.default_rng(0).dirichlet(np.full(len(choice.shares), 0.3), 50):
-        assert shares @ choice.budgets[0] <= ALLOWED + 1e-12
+def get_observed_link(record: AgeRecord) -> tuple[float, float]:
+    assert record.link is not None
+    return get_link(get_observed_level(record.link))
 
 
-def test_each_level_keeps_the_allowed_risk_on_the_configured_link(
-    solver: ConditionedSolver, choice: BudgetChoice
-) -> None:
-    for level in solver.levels:
-        spent = level.near.risk.budgets @ choice.shares[:-1]
-        assert spent <= ALLOWED * (1.0 + 1e-9)
-        assert spent == pytest.approx(ALLOWED - choice.shares[-1], rel=1e-3)
-    unscaled = [rank for rank, scale in enumerate(choice.scales) if scale == 1.0]
-    assert [choice.levels[rank] for rank in unscaled] == [0, 1, 2]
-    assert choice.budgets[unscaled] @ choice.shares == pytest.approx(ALLOWED, rel=1e-3)
-
-
-def test_scaled_budgets_are_the_risk_of_rows_with_scaled_back_offs(choice: BudgetChoice) -> None:
-    """However rows share a budget, they keep no more of it than one row alone."""
-    rng = np.random.default_rng(1)
-    for budget, scale in zip(rng.uniform(0.001, 0.5, 200), rng.uniform(1.0, 2.2, 200), strict=True):
-        (left,) = adaptation.scale_budgets(np.array([budget]), scale)
-        assert left == pytest.approx(norm.sf(scale * norm.isf(budget)), rel=1e-9)
-        shares = rng.dirichlet(np.ones(3)) * budget
-        assert norm.sf(scale * norm.isf(shares)).sum() <= left * (1.0 + 1e-9)
-    assert adaptation.scale_budgets(np.array([0.7, 1.0]), 2.0).tolist() == [0.7, 1.0]
-
-
-def test_higher_levels_give_old_information_more_and_cost_less(solver: ConditionedSolver, choice: BudgetChoice) -> None:
-    oldest = np.array([level.near.risk.budgets[-1] for level in solver.levels])
-    assert (np.diff(oldest) > 0.0).all()
-    for level in (1, 2):
-        ranks = [rank for rank, own in enumerate(choice.levels) if own == level]
-        assert (np.diff(choice.budgets[ranks, -2]) > 0.0).all()
-        assert (np.diff([choice.scales[rank] for rank in ranks]) < 0.0).all()
-    state = np.array([0.0, 0.0, 17.0, 0.0])
-    target = solver.problem.target
-    costs = [solver.solve(0, state, target, Preview(level=level)).cost for level in range(len(solver.levels))]
-    assert costs[-1] < costs[0]
+def test_the_certificate_keeps_the_allowed_risk_on_any_link(solver: ConditionedSolver) -> None:
+    budgets = solver.select_risk(solver.problem.target, Preview(level=CERTIFICATE_LEVEL)).budgets
+    for shares in np.random.default_rng(0).dirichlet(np.full(len(budgets), 0.3), 50):
+        assert shares @ budgets <= ALLOWED + 1e-12
 
 
 def test_without_a_level_a_plan_is_that_of_the_configured_link(solver: ConditionedSolver) -> None:
     state, target = np.array([0.0, 0.0, 17.0, 0.0]), solver.problem.target
     plain = ConditionedSolver(solver.problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, bounds_slack=False)
     assert plain.solve(0, state, target).inputs.tobytes() == solver.solve(0, state, target).inputs.tobytes()
+    with pytest.raises(QuestionError, match="level"):
+        plain.solve(0, state, target, Preview(level=get_observed_level(0)))
 
 
-def test_no_data_are_the_certificate_and_a_long_matching_record_gives_most(choice: BudgetChoice) -> None:
-    assert AgeRecord().rank == 0
-    assert record_ages(draw_ages(20, LOSS, 1.0, 1), choice).rank < len(choice.budgets) - 1
-    assert record_ages(draw_ages(3000, LOSS, 1.0, 1), choice).rank == len(choice.budgets) - 1
+def test_a_record_begins_with_the_certificate(prior: AgePrior) -> None:
+    assert AgeRecord().link is None
+    assert record_ages(draw_ages(adaptation.REVIEW_STEPS - 1, LOSS, 1.0, 1), prior).link is None
 
 
-@pytest.mark.parametrize(("loss", "burst"), [(0.3, 3.0), (0.3, 10.0), (0.6, 1.0), (0.8, 10.0)])
-def test_a_link_that_differs_keeps_the_allowed_risk(choice: BudgetChoice, loss: float, burst: float) -> None:
-    ages = draw_ages(40_000, loss, burst, 2)
-    shares = np.bincount(np.minimum(ages, len(choice.shares)) - 1, minlength=len(choice.shares)) / len(ages)
-    for seed in range(5):
-        rank = record_ages(draw_ages(1000, loss, burst, seed), choice).rank
-        assert shares @ choice.budgets[rank] <= ALLOWED * (1.0 + adaptation.END_TOLERANCE)
-        assert rank > 0
+@pytest.mark.parametrize(("loss", "burst"), [(0.1, 1.0), (0.3, 1.0), (0.3, 3.0), (0.6, 1.0), (0.6, 5.0), (0.8, 10.0)])
+def test_bounds_of_a_long_record_are_above_the_link_and_near_it(prior: AgePrior, loss: float, burst: float) -> None:
+    first_loss = loss if burst == 1.0 else loss / (burst * (1.0 - loss))
+    continuation = loss if burst == 1.0 else 1.0 - 1.0 / burst
+    bounds = np.array(
+        [adaptation.bound_link(record_ages(draw_ages(1500, loss, burst, seed), prior).counts) for seed in range(60)]
+    )
+    for found, true in zip(bounds.T, (first_loss, continuation), strict=True):
+        odds, true_odds = found / (1.0 - found), true / (1.0 - true)
+        assert np.mean(found >= true) > 0.7  # one standard deviation: 84 %
+        assert 1.0 < np.median(odds) / true_odds < 2.0
 
 
-def test_a_link_that_changes_takes_the_budgets_back(choice: BudgetChoice) -> None:
-    record = record_ages(draw_ages(3000, LOSS, 1.0, 3), choice)
-    assert record.rank == len(choice.budgets) - 1
-    record = record_ages(draw_ages(200, 0.6, 1.0, 3), choice, record)
-    assert record.contradicts
-    assert choice.scales[record.rank] > 1.2 or record.rank == 0
-    assert not record_ages(draw_ages(3000, LOSS, 1.0, 4), choice, record).contradicts
+def test_few_steps_of_a_good_link_do_not_rule_out_long_runs(prior: AgePrior) -> None:
+    _, continuation = adaptation.bound_link(record_ages([1] * 30, prior).counts)
+    assert continuation > 0.8
 
 
-def test_bounds_hold_the_true_shares_as_often_as_they_state(choice: BudgetChoice) -> None:
-    """Each bound separately, without the configured link."""
-    shares = choice.shares
-    missed = np.zeros((2, 4))
-    for seed in range(200):
-        counts = np.bincount(draw_ages(400, LOSS, 1.0, seed), minlength=40)[1 : len(shares) + 1].astype(float)
-        lower, upper = adaptation.bound_shares(counts, shares, contradicts=True)
-        missed += shares[:4] < lower[:4], shares[:4] > upper[:4]
-    assert (missed / 200 <= 2.0 * (1.0 - adaptation.CONFIDENCE)).all()
+def test_a_record_follows_a_link_that_changes(prior: AgePrior) -> None:
+    before = record_ages(draw_ages(3000, LOSS, 1.0, 3), prior)
+    after = record_ages(draw_ages(500, 0.6, 1.0, 3), prior, before)
+    assert get_observed_link(before) == (0.3, 0.3)
+    assert min(get_observed_link(after)) >= 0.55
+    assert get_observed_link(record_ages(draw_ages(2000, LOSS, 1.0, 4), prior, after)) == (0.3, 0.3)
+
+
+def test_positions_that_are_late_are_no_losses(prior: AgePrior) -> None:
+    late = [age + 2 for age in draw_ages(3000, LOSS, 1.0, 3)]
+    assert get_observed_link(record_ages(late, prior)) == (0.3, 0.3)
 
 
 def simulate_loop(risk_of_widening: float, steps: int) -> tuple[LoopState, float]:
@@ -174,13 +146,11 @@ def test_the_loop_saturates_where_nothing_helps() -> None:
     assert state.widening == adaptation.MAX_WIDENING
 
 
-def test_scale_and_loop_together_take_little_from_the_back_offs() -> None:
+def test_quiet_steps_alone_take_no_more_than_half_of_the_distances() -> None:
     state = LoopState(steps=10**6)
     for _ in range(5000):
         state = charge_risk(state, 0.0, ALLOWED, keeps_away=True, is_behind_horizon=False)
     assert state.widening == adaptation.MIN_WIDENING
-    assert adaptation.combine_widenings(1.0, state) == adaptation.MIN_TOTAL_WIDENING
-    assert adaptation.combine_widenings(2.0, state) == pytest.approx(1.0)
 
 
 def test_safe_steps_far_from_limits_lower_f_to_one_and_no_further() -> None:
@@ -250,5 +220,7 @@ def test_the_risk_of_a_step_adds_its_rows_and_counts_a_wider_spread() -> None:
     risk = adaptation.compute_outside_risk(margins, variances, 1.0)
     assert risk == pytest.approx(0.158655 + 0.022750, abs=1e-6)
     assert adaptation.compute_outside_risk(margins, variances, 2.0) > risk
-    assert adaptation.compute_outside_risk(margins, variances, 0.8) == risk
+    assert adaptation.compute_outside_risk(margins, variances, 0.9) < risk
+    least = adaptation.compute_outside_risk(margins, variances, adaptation.MIN_SPREAD)
+    assert adaptation.compute_outside_risk(margins, variances, 0.1) == least
     assert adaptation.compute_outside_risk(np.array([-1.0]), np.zeros(1), 1.0) == 1.0

@@ -17,13 +17,13 @@ from uavctl.smpc.conditioned.adaptation import (
     LoopState,
     SpreadState,
     charge_risk,
-    combine_widenings,
     compute_outside_risk,
     count_age,
     count_innovation,
 )
 from uavctl.smpc.conditioned.backoffs import RowDeviations
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_budget_choice
+from uavctl.smpc.conditioned.planner import ConditionedSolver, make_age_prior
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_observed_level
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import find_parts, propagate_covariance
 from uavctl.wiring.controller import build_problem
@@ -59,7 +59,7 @@ def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapt
     covs, rows, sides = propagate_covariance(plant, STEPS), problem.state_set.c, problem.state_set.b
     arrived = rng.random(STEPS) >= LOSS
     disturbances = draw_disturbances(kind, STEPS, rng) @ np.linalg.cholesky(plant.w).T
-    choice, ages, loop = make_budget_choice(solver, ALLOWED), AgeRecord(), LoopState()
+    prior, ages, loop = make_age_prior(solver, ALLOWED), AgeRecord(), LoopState()
     x, mean, newest, outside = problem.target.copy(), problem.target.copy(), 0, np.zeros(STEPS)
     plan, spread, places = solver.solve(0, x, problem.target), SpreadState(), list(plant.position_index)
     for k in range(STEPS):
@@ -70,15 +70,15 @@ def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapt
                 spread = count_innovation(spread, (x - mean)[places].tolist(), expected.tolist())
                 newest, mean = k, x
             age = k - newest
-            ages = count_age(ages, before + 1, choice)
+            ages = count_age(ages, before + 1, prior)
             variances = np.einsum("mi,ij,mj->m", rows, covs[age], rows)
             is_behind = age >= horizon
             risk = compute_outside_risk(sides - rows @ mean, variances, spread.spread)
             loop = charge_risk(loop, risk, ALLOWED, keeps_away=plan.offset > 0.0, is_behind_horizon=is_behind)
             if arrived[k]:
                 preview = Preview(
-                    level=choice.levels[ages.rank],
-                    widening=combine_widenings(choice.scales[ages.rank], loop),
+                    level=CERTIFICATE_LEVEL if ages.link is None else get_observed_level(ages.link),
+                    widening=loop.widening,
                     silence_widening=loop.silence_widening,
                 )
                 plan = solver.solve(k, x, problem.target, preview if adapts else Preview())

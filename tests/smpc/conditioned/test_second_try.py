@@ -13,6 +13,7 @@ from uavctl.config.load import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned import planner
+from uavctl.smpc.conditioned.backoffs import allocate_equally
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import PartProgram
 from uavctl.smpc.link import bernoulli
@@ -24,7 +25,8 @@ from uavctl.wiring.controller import build_problem
 # Found among 240,000 random states, ages and spreads: in the program of the second axis DAQP cycles.
 STATE = ("0x1.d9acb060ddc60p+3", "0x1.e8019fbf626b8p+3", "0x1.70433dacaca60p+3", "0x1.c6aff29e7937ep+2")
 TARGET = ("0x1.3251fdc499278p+4", "0x0.0p+0", "-0x1.ae89e0f8796f3p+4", "0x0.0p+0")
-AGE, LEVEL, WIDENING, SILENCE_WIDENING = 3, 2, 2.5, 4.0
+AGE, WIDENING, SILENCE_WIDENING = 3, 2.5, 4.0
+BUDGETS = [0.024342178991304114, 0.08150945454469351, 0.15084698675371555, 0.22829261633689882] + 8 * [0.25]
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +39,11 @@ def solver() -> ConditionedSolver:
         q_u=0.1 * np.eye(2),
     )
     with pytest.MonkeyPatch.context() as patch:
+        risk = allocate_equally(bernoulli(np.array([0.7])), len(BUDGETS), 0.05, 2)
+        patch.setattr(planner, "allocate_by_age", lambda *_: replace(risk, budgets=np.array(BUDGETS)))
         # Bounded, the widening of STATE makes another program.
         patch.setattr(planner, "find_opposite_rows", lambda c: np.zeros((0, 2), dtype=np.intp))
-        return ConditionedSolver(problem, bernoulli(np.array([0.7])), 0.05, has_lower_levels=True)
+        return ConditionedSolver(problem, bernoulli(np.array([0.7])), 0.05)
 
 
 def solve_by_interior_points(program: QuadraticProgram, rows: Array, upper: Array, lower: Array) -> Array:
@@ -95,7 +99,7 @@ def test_a_program_that_cycles_is_solved_from_other_rows(
     monkeypatch.setattr(PartProgram, "solve", find_rows)
     x, target = (np.array([float.fromhex(value) for value in values]) for values in (STATE, TARGET))
     cov = propagate_covariance(solver.problem.plant, AGE)[AGE]
-    preview = Preview(age=AGE, cov=cov, level=LEVEL, widening=WIDENING, silence_widening=SILENCE_WIDENING)
+    preview = Preview(age=AGE, cov=cov, widening=WIDENING, silence_widening=SILENCE_WIDENING)
     answer = solver.solve(0, x, target, preview)
     assert answer.status is SolveStatus.OPTIMAL
     found = [z for *_, z in asked]

@@ -16,6 +16,10 @@
 4. The cost is that of the regulator. With u_t = u_s + K(x_t - x_s) + c_t and the Riccati solution after stage H it is
    |z|² plus a constant, z = L'c, L L' = R + B'PB. If z = 0 keeps all limits within the budgets, it is the answer. Else
    each independent part that violates a limit solves a strictly convex program.
+5. At the levels of observed links the reference moves away from a limit with the age: stage t is flown with information
+   a + t steps old, by the regulator around the reference r_{a+t} of that age, see `reference`. So z = 0 stands for the
+   inputs u_t = u_s + K(x_t - r_{a+t}). The distances keep the risk in the mean of all plans, so rows have no back-offs.
+   Along motions they have back-offs, by the budgets of that link.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import (
+    CONFIGURED_LEVEL,
     INPUT_TOLERANCE,
     KEPT_TOLERANCE,
     NOMINAL,
@@ -41,7 +46,7 @@ from uavctl.smpc.answer import (
     is_finite,
 )
 from uavctl.smpc.batch import Decisions, gather_answers
-from uavctl.smpc.conditioned.adaptation import BudgetChoice, scale_budgets
+from uavctl.smpc.conditioned.adaptation import AgePrior
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
     DISTANT_SHARE,
@@ -60,7 +65,8 @@ from uavctl.smpc.conditioned.backoffs import (
     reallocate_to_rows,
 )
 from uavctl.smpc.conditioned.program import PartProgram, ReferenceEquilibria, RegulatedRows, SlewRows
-from uavctl.smpc.link import AgeModel
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, COUNTED_HORIZONS, ReferenceProgram, get_link
+from uavctl.smpc.link import AgeModel, RunLengthAges
 from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import OPEN
@@ -70,12 +76,7 @@ METHOD = "age-conditioned"
 ROUNDS = 2  # rounds of an allocation
 # Rounds if the plan does not keep its back-offs: half of the plans between two near walls need the third.
 MAX_ROUNDS = 3
-# Largest budget of an age at each level between the certificate and the configured link, as a multiple of the allowed
-# risk: of those simulated from 1.25 to 5, the first is cheapest where losses come in long runs, the second elsewhere
-MAX_BUDGET_FACTORS = (2.5, 5.0)
-# Factors of the deviations with which these levels fly on links worse than the configured one: steps of a tenth, so
-# that a record frees risk gradually, up to what 80 % losses need
-SCALES = tuple(round(1.1**power, 2) for power in range(8, -1, -1))
+SILENT_STAGES = 2  # stages at the end of a plan that a silence may outlast: a regulator is at its reference in two
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
 
@@ -96,20 +97,20 @@ class _Allocation:
     budgets: Array  # ε̄ of the stages (H, H)
     quantiles: Array  # quantiles of rows that share the budgets equally (H, H, 1)
     distant_quantiles: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
-    # Distance of the reference from each row (n, m), by the number of rows that limit a target
+    # Distance of the reference from each row (A, n, m), by the age and the number of rows that limit a target. It does
+    # not fall with age, and the last one is that of a plan at rest
     reference_backoffs: Array
 
 
 @dataclass(frozen=True, eq=False)
 class RiskLevel:
-    """Allocations of one level of the budgets. Level 0 is the certificate, the last one that of the configured link."""
+    """Allocations of one level of the budgets."""
 
-    near: _Allocation  # beside limits and along motions
+    near: _Allocation  # beside limits
+    motion: _Allocation  # along motions, whose plans meet limits at any age
     transit: _Allocation  # where the target is far from all limits
     far: Array  # distance (m,) of a target from each row beyond which it is far from it
-    # Without limits of a preview and widening: bounds on a target far from limits, and on one that needs no reference
-    transit_bounds: Array
-    target_bounds: Array
+    transit_bounds: Array  # bounds on a target far from limits, without limits of a preview and widening
 
 
 class _Rest(msgspec.Struct, frozen=True, eq=False):
@@ -120,6 +121,8 @@ class _Rest(msgspec.Struct, frozen=True, eq=False):
     sides: Array  # right sides of the state rows minus their values at the reference, (H, m) or (m,)
     equilibrium_input: Array | None  # input there (n_u,); None for zero
     offset: float  # l1 distance of the reference from the target, in equilibrium coordinates
+    # z (H, n_u) of the part's plan around the references by age, for the programs whose references differ by age
+    shifts: Sequence[tuple[PartProgram, Array]]
 
 
 class _PlanResult(msgspec.Struct, frozen=True, eq=False):
@@ -143,7 +146,7 @@ class ConditionedSolver:
         slew_mps3: Largest change of the acceleration setpoint in a second [m/s³], see `SlewRows`; infinite: no limit.
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
-        has_lower_levels: Whether there are levels of the budgets below that of the configured link.
+        has_lower_levels: Whether there are the certificate and the levels of observed links.
         bounds_slack: Whether new plans beside a limit may seldom need slack, see `compute_reference_backoffs`.
 
     Raises:
@@ -167,7 +170,7 @@ class ConditionedSolver:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
-        self._terminal_cost = law.p
+        self._law, self._allowed = law, allowed
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
         parts = find_parts(problem, self._slew.d)
         driven = {int(state) for part in parts for state in part.states}
@@ -204,10 +207,8 @@ class ConditionedSolver:
         n_parts = len(self._parts)
 
         def make_allocation(risk: AgeRisk) -> _Allocation:
-            # Row a, column t - 1: index of the budget of stage t of a plan from a position of age a
-            ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-            budgets, reference_backoffs = risk.row_budgets[ages], np.zeros((n_parts, width))
-            reference_backoffs[:, self._reference_rows] = compute_reference_backoffs(
+            reference_backoffs = np.zeros((1, n_parts, width))
+            reference_backoffs[0][:, self._reference_rows] = compute_reference_backoffs(
                 problem,
                 risk,
                 allowed,
@@ -218,66 +219,115 @@ class ConditionedSolver:
                 self.filter_plant,
                 bounds_slack=bounds_slack,
             )
-            equal_budgets = budgets / max(1, width)
-            return _Allocation(
-                risk,
-                budgets,
-                compute_quantile(equal_budgets)[:, :, None],
-                compute_quantile(DISTANT_SHARE * equal_budgets)[:, :, None],
-                reference_backoffs,
-            )
+            return self._make_allocation(risk, reference_backoffs)
 
         deviations = self._select_position_deviations()
         near = make_allocation(allocate_by_age(link, deviations, allowed, exponent, n_parts))
-        transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
-        self.levels: tuple[RiskLevel, ...] = (self._make_level(near, transit, transit.risk, allowed),)
+        # Where a target is far from all limits, limits matter in transit only, and all levels share one allocation.
+        self._transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
+        self._levels = {CONFIGURED_LEVEL: self._make_level(near, self._transit.risk)}
+        self._free: _Allocation | None = None
         if has_lower_levels:
-            # Where a target is far from all limits, limits matter in transit only, and all levels share one allocation.
-            is_possible = np.arange(steps) < self._count_possible_ages(cov, allowed)
-            certificate = AgeRisk(transit.risk.age_probabilities, 0.0, np.full(steps, allowed))
-            bounded = (
-                allocate_by_age(link, deviations, allowed, exponent, n_parts, factor * allowed)
-                for factor in MAX_BUDGET_FACTORS
-            )
-            lower = (
-                replace(risk, budgets=np.where(is_possible, risk.budgets, 1.0)) for risk in (certificate, *bounded)
-            )
-            self.levels = (
-                *(self._make_level(make_allocation(risk), transit, risk, allowed) for risk in lower),
-                *self.levels,
-            )
+            risk, is_possible = near.risk, np.arange(steps) < self._count_possible_ages(cov, allowed)
+            budgets = np.where(is_possible, allowed, 1.0)
+            certificate = AgeRisk(self._transit.risk.age_probabilities, 0.0, budgets)
+            self._levels[CERTIFICATE_LEVEL] = self._make_level(make_allocation(certificate), certificate)
+            free = replace(risk, budgets=np.ones(steps))
+            self._free = self._make_allocation(free, np.zeros((1, n_parts, width)))
+            begins = int(risk.age_probabilities.argmax())
+            last, n_x = begins + COUNTED_HORIZONS * steps, plant.n_x
+            self._error_covs = propagate_covariance(self.filter_plant, last, cov)[begins:, :n_x, :n_x]
+            self._reference_programs = self._make_reference_programs()
         self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
-        self._cached_backoffs: tuple[tuple[bool, int, int, float, float, bytes], _RowBackoffs] | None = None
+        self._cached_backoffs: tuple[tuple[int, int, int, float, float, bytes], _RowBackoffs] | None = None
 
-    def _make_level(self, near: _Allocation, transit: _Allocation, risk: AgeRisk, allowed: float) -> RiskLevel:
+    def _make_allocation(self, risk: AgeRisk, reference_backoffs: Array) -> _Allocation:
+        steps = self.problem.horizon
+        # Row a, column t - 1: index of the budget of stage t of a plan from a position of age a
+        ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
+        budgets = risk.row_budgets[ages]
+        equal_budgets = budgets / max(1, self._rows.size)
+        return _Allocation(
+            risk,
+            budgets,
+            compute_quantile(equal_budgets)[:, :, None],
+            compute_quantile(DISTANT_SHARE * equal_budgets)[:, :, None],
+            reference_backoffs,
+        )
+
+    def _make_level(self, near: _Allocation, risk: AgeRisk, motion: _Allocation | None = None) -> RiskLevel:
         """Make a level.
 
         Args:
             risk: Risk by age whose oldest age with a back-off decides which targets are far from limits.
+            motion: Allocation along motions; None: `near`.
         """
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(risk.budgets < 1.0))
         oldest = self._deviations.compute(None)[max(0, counts - 1)]
-        far = np.maximum(
-            transit.reference_backoffs[-1], float(compute_quantile(np.array(allowed / len(self._parts)))) * oldest
-        )
-        return RiskLevel(
-            near,
-            transit,
-            far,
-            transit_bounds=(self._b - far)[self._reference_rows],
-            target_bounds=(self._b - near.reference_backoffs[0])[self._reference_rows],
-        )
+        share = np.array(self._allowed / len(self._parts))
+        distance = np.maximum(self._transit.reference_backoffs[-1, -1], near.reference_backoffs[-1, -1])
+        far = np.maximum(distance, float(compute_quantile(share)) * oldest)
+        return RiskLevel(near, motion or near, self._transit, far, transit_bounds=(self._b - far)[self._reference_rows])
+
+    def _get_level(self, level: int) -> RiskLevel:
+        """Return a level; that of an observed link is made when it is asked for first."""
+        found = self._levels.get(level)
+        if found is None:
+            if self._free is None:
+                raise QuestionError(f"level {level}: the design has the budgets of the configured link alone")
+            allocation = replace(self._free, reference_backoffs=self._find_distances(get_link(level)))
+            found = self._levels[level] = self._make_level(allocation, allocation.risk, self._make_motion(level))
+        return found
+
+    def _make_motion(self, level: int) -> _Allocation:
+        """Make the allocation of an observed link along motions: its own, or the certificate's if none exists."""
+        assert self._free is not None, "only levels of observed links are made later"
+        begins = int(self._free.risk.age_probabilities.argmax())
+        try:
+            risk = allocate_by_age(
+                RunLengthAges(*get_link(level), begins),
+                self._select_position_deviations(),
+                self._allowed,
+                n_binding=len(self._parts),
+            )
+        except DesignError:
+            return self._levels[CERTIFICATE_LEVEL].near
+        return self._make_allocation(risk, self._free.reference_backoffs)
+
+    def _make_reference_programs(self) -> dict[int, ReferenceProgram]:
+        """Make the program of each row that limits equilibria; alike rows share one."""
+        programs: dict[int, ReferenceProgram] = {}
+        shared: dict[bytes, ReferenceProgram] = {}
+        for part in self._parts:
+            for row in np.intersect1d(np.arange(self._rows.size)[part.columns], self._reference_rows):
+                program = ReferenceProgram(
+                    self.problem, self._law, part.part, self._equilibria, self._c[row], self._error_covs
+                )
+                programs[int(row)] = shared.setdefault(program.key, program)
+        return programs
+
+    def _find_distances(self, link: tuple[float, float]) -> Array:
+        """Find the distances (H, n, m) of the reference by age from each row, for 1 … n rows that share the risk."""
+        n_parts = len(self._parts)
+        distances = np.zeros((self.problem.horizon, n_parts, self._rows.size))
+        for n_rows in range(1, n_parts + 1):
+            of_program: dict[ReferenceProgram, Array] = {}
+            for row, program in self._reference_programs.items():
+                if program not in of_program:
+                    of_program[program] = program.find_distances(link, self._allowed / n_rows)
+                distances[:, n_rows - 1, row] = of_program[program]
+        return distances
 
     @property
     def risk(self) -> AgeRisk:
         """Risk by age near limits and along motions."""
-        return self.levels[-1].near.risk
+        return self._levels[CONFIGURED_LEVEL].near.risk
 
     @property
     def transit_risk(self) -> AgeRisk:
         """Risk by age where the target is far from all limits."""
-        return self.levels[-1].transit.risk
+        return self._transit.risk
 
     def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
@@ -288,7 +338,7 @@ class ConditionedSolver:
     def compute_reference_limits(self) -> Array:
         """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self.levels[-1].near.reference_backoffs[-1]
+        sides[self._rows] -= self._levels[CONFIGURED_LEVEL].near.reference_backoffs[-1, -1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
@@ -310,20 +360,22 @@ class ConditionedSolver:
         dx = x - reference
         lower, upper, input_reduction = self._find_input_bounds(preview)
         margin_x, hard = self._regulated.compute_margin(dx, rest.sides, equilibrium_input, first, input_reduction)
-        path_z: list[tuple[PartProgram, Array]] = []
+        given_z: list[tuple[PartProgram, Array]] = []
         if preview.path is not None:
-            path_z = [
-                (program, program.follow_path(preview.path.states, preview.path.inputs)) for program in self._parts
-            ]
-            for program, z in path_z:
-                program.subtract_margin(z, margin_x, hard)
+            path = preview.path
+            given_z = [(program, program.follow_path(path.states, path.inputs)) for program in self._parts]
+        else:
+            ages = slice(preview.age, preview.age + self.problem.horizon)
+            given_z = [(program, shift[ages].ravel()) for program, shift in rest.shifts]
+        for program, z in given_z:
+            program.subtract_margin(z, margin_x, hard)
         result = self._allocate_rows(margin_x, hard, row_backoffs)
         if result is None:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         inputs, states = self._regulated.plan(dx)
-        for program, z in (*path_z, *result.z_of_program):
+        for program, z in (*given_z, *result.z_of_program):
             program.add_to_plan(z, inputs, states)
-        cost, slack, relaxed = self._compute_cost(inputs, states, result, preview)
+        cost, slack, relaxed = self._compute_cost(inputs, states, given_z, result, preview)
         if first is not None and max(first[1].tolist()) > self._slew.side + KEPT_TOLERANCE:
             relaxed += self._find_relaxed_slew(first[1])
         states += reference
@@ -364,14 +416,58 @@ class ConditionedSolver:
     def _make_rest(self, target: Array, preview: Preview) -> _Rest:
         held, limits = self._equilibria.held, self._select_limits(preview)
         target_rows = self._equilibrium_rows.dot(target[held])
-        reference = self._find_reference(target, target_rows, limits, preview)
+        reference = self._find_reference(target, limits, preview)
         return _Rest(
             allocation=self._select_allocation(target_rows, limits, preview),
             reference=reference,
             sides=limits - self._c.dot(reference),
             equilibrium_input=self._equilibria.u_eq @ reference[held] if self._has_equilibrium_input else None,
             offset=float(np.abs((reference - target)[held]).sum()),
+            shifts=self._find_shifts(target, reference, limits, preview),
         )
+
+    def _find_shifts(
+        self, target: Array, rest: Array, limits: Array, preview: Preview
+    ) -> Sequence[tuple[PartProgram, Array]]:
+        """Find the z (2 H, n_u) of each part around the references by age 0 … 2 H - 1.
+
+        The reference of an age is on the line from the target to the reference `rest` of a plan at rest, where the rows
+        that limit it keep the distances of the age.
+        """
+        if len(self._get_level(preview.level).near.reference_backoffs) == 1 or preview.path is not None:
+            return ()
+        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        count = self._count_limits(target, sides, preview)
+        if not count:
+            return ()
+        distances = self._widen_distances(count, preview)
+        # Margins (m,) at the target and at rest; the row keeps d_j with the share λ_j of the way between them
+        at_target, at_rest = sides - self._c @ target, sides - self._c @ rest
+        is_limit = (at_target < distances[-1]) & (at_rest > at_target)
+        way = np.where(is_limit, at_rest - at_target, 1.0)
+        shares = np.where(is_limit, (distances - at_target) / way, 0.0).clip(0.0, 1.0)
+        ages = np.minimum(np.arange(2 * self.problem.horizon), len(distances) - 1)
+        back = target - rest
+        back_u = self._equilibria.u_eq @ back[self._equilibria.held]
+        return [
+            (program, np.outer(1.0 - shares[ages, program.columns].max(axis=1), program.find_shift(back, back_u)))
+            for program in self._parts
+            if is_limit[program.columns].any()
+        ]
+
+    def _widen_distances(self, count: int, preview: Preview) -> Array:
+        """Return the distances (A, m) by age of a target that `count` rows limit: the last ones hold for a silence."""
+        backoffs = self._get_level(preview.level).near.reference_backoffs
+        distances: Array = preview.widening * backoffs[:, min(count, len(self._parts)) - 1]
+        if len(distances) > 1:
+            distances[-SILENT_STAGES:] *= preview.silence_widening
+        return distances
+
+    def _count_limits(self, target: Array, sides: Array, preview: Preview) -> int:
+        """Count the rows that limit a target: those that are nearer than one row alone would keep."""
+        backoffs = self._get_level(preview.level).near.reference_backoffs[-1, 0]
+        kept = (sides - preview.widening * backoffs)[self._reference_rows]
+        return int(np.count_nonzero(self._equilibrium_rows.dot(target[self._equilibria.held]) > kept))
 
     def _select_limits(self, preview: Preview) -> Array:
         """Return the right sides of the state rows, of each stage (H, m) or of all (m,)."""
@@ -386,9 +482,9 @@ class ConditionedSolver:
         Args:
             target_rows: Values of the rows of resting places at the target.
         """
-        level = self.levels[preview.level]
+        level = self._get_level(preview.level)
         if preview.path is not None:
-            return level.near
+            return level.motion
         kept = level.transit_bounds
         if limits is not self._b or preview.widening != 1.0:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
@@ -401,13 +497,13 @@ class ConditionedSolver:
         The age acts twice. It selects the budget of each stage, as stage t has information a + t steps old. And the
         covariance P of the estimate, from which σ_ti follows, has grown since the position.
         """
-        in_transit = allocation is self.levels[preview.level].transit
         cov_bytes = b"" if preview.cov is None else preview.cov.tobytes()
-        key = in_transit, preview.level, preview.age, preview.widening, preview.silence_widening, cov_bytes
+        key = id(allocation), preview.level, preview.age, preview.widening, preview.silence_widening, cov_bytes
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             plain, age = self._deviations.compute(preview.cov), preview.age
             sigma = bound_widening(preview.widening * plain, plain, allocation.quantiles[age], self._b, self._opposite)
-            sigma[len(sigma) - 1 - age :] *= preview.silence_widening
+            if len(allocation.reference_backoffs) == 1:
+                sigma[len(sigma) - 1 - age :] *= preview.silence_widening
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
             backoff = allocation.quantiles[age] * sigma
             self._cached_backoffs = (
@@ -416,19 +512,13 @@ class ConditionedSolver:
             )
         return self._cached_backoffs[1]
 
-    def _find_reference(self, target: Array, target_rows: Array, limits: Array, preview: Preview) -> Array:
-        """Return the equilibrium (n_x,) nearest to the target; the rows that limit it share the budgets."""
-        level = self.levels[preview.level]
-        backoffs, sides, kept = level.near.reference_backoffs, limits, level.target_bounds
-        if limits is not self._b or preview.widening != 1.0:
-            sides = limits if limits.ndim == 1 else limits.min(axis=0)
-            kept = (sides - preview.widening * backoffs[0])[self._reference_rows]
-        reference, count = np.array(target), np.count_nonzero(target_rows > kept)
+    def _find_reference(self, target: Array, limits: Array, preview: Preview) -> Array:
+        """Return the equilibrium (n_x,) nearest to the target at rest; the rows that limit it share the budgets."""
+        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        reference, count = np.array(target), self._count_limits(target, sides, preview)
         if not count:
             return reference
-        distance = backoffs[min(int(count), len(self._parts)) - 1]
-        if preview.widening != 1.0:
-            distance = preview.widening * distance
+        distance = self._widen_distances(count, preview)[-1]
         for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
@@ -520,17 +610,19 @@ class ConditionedSolver:
         return result
 
     def _compute_cost(
-        self, du: Array, dx: Array, result: _PlanResult, preview: Preview
+        self, du: Array, dx: Array, given_z: Sequence[tuple[PartProgram, Array]], result: _PlanResult, preview: Preview
     ) -> tuple[float, float, tuple[GaveWay, ...]]:
         """Return the cost of a plan from its deviations (H, n_u), (H+1, n_x), the sum of its slacks, and the slacks."""
         problem = self.problem
         if preview.path is None:
             # x_0'P x_0 + |z|²
-            cost = dx[0].dot(self._terminal_cost).dot(dx[0]) + sum([z.dot(z) for _, z in result.z_of_program])
+            of_part = dict(given_z)
+            all_z = [z + of_part.pop(program, 0.0) for program, z in result.z_of_program]
+            cost = dx[0].dot(self._law.p).dot(dx[0]) + sum([z.dot(z) for z in (*all_z, *of_part.values())])
         else:
             # Σ_t (x_t - p_t)'Q_x(x_t - p_t) + (u_t - r_t)'Q_u(u_t - r_t) + x_H'P x_H
             last, dx, du = dx[-1], dx[:-1] - preview.path.states, du - preview.path.inputs
-            cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._terminal_cost @ last
+            cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._law.p @ last
         if not result.z_of_program:
             return float(cost), 0.0, ()
         excess = np.maximum(result.backoff - result.margin, 0.0)
@@ -608,23 +700,10 @@ class ConditionedDecider:
         return gather_answers(answers, (problem.horizon, problem.plant.n_u))
 
 
-def make_budget_choice(solver: ConditionedSolver, allowed: float) -> BudgetChoice:
-    """Make the budgets to choose from: the certificate, then each level between it and the configured link by scale.
-
-    What is older than the horizon, or than any plan can keep a limit for, has the certificate's budget at the first of
-    these levels: the end of its plans keeps away for a silence. At the others it counts in full.
+def make_age_prior(solver: ConditionedSolver, allowed: float) -> AgePrior:
+    """Make the prior of a record of ages: the configured link.
 
     Args:
         allowed: 1 - δ_x.
     """
-    risk, size = solver.risk, solver.problem.horizon + 1
-    budgets, levels, scales = [np.full(size, allowed)], [0], [1.0]
-    for level in range(1, len(solver.levels) - 1):
-        own = np.append(solver.levels[level].near.risk.budgets, 1.0)
-        for scale in SCALES:
-            scaled = scale_budgets(own, scale)
-            budgets.append(np.where(own < 1.0, scaled, allowed) if level == 1 else scaled)
-            levels.append(level)
-            scales.append(scale)
-    shares = np.append(risk.age_probabilities, risk.older_probability)
-    return BudgetChoice(allowed, shares, np.array(budgets), tuple(levels), tuple(scales))
+    return AgePrior(allowed, np.append(solver.risk.age_probabilities, solver.risk.older_probability))

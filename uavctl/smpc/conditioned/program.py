@@ -115,6 +115,8 @@ class PartProgram:
     ) -> None:
         self.part, self.columns, self.hard = part, columns, hard
         self._steps = steps = problem.horizon
+        self._k = law.k[np.ix_(part.inputs, part.states)]
+        self._z_of_input = np.linalg.cholesky(law.weight[np.ix_(part.inputs, part.inputs)]).T
         states, inputs = (prediction[:, :, part.states.size :] for prediction in predict_regulated(problem, law, part))
         n = states.shape[2]
         self._plan = np.vstack([inputs.reshape(-1, n), states[1:].reshape(-1, n)])
@@ -165,6 +167,18 @@ class PartProgram:
         part = self.part
         z: Array = self._path_map_x @ path_x[:, part.states].ravel()
         z += self._path_map_u @ path_u[:, part.inputs].ravel()
+        return z
+
+    def find_shift(self, state: Array, input_: Array) -> Array:
+        """Return the z_t (n_u,) of the regulator around an equilibrium that is shifted by `state`, `input_`.
+
+        Args:
+            state: Shift of the equilibrium (n_x,), of the whole plant.
+            input_: Shift of its input (n_u,).
+        """
+        # z_t = L'c_t,  c_t = u_s - K x_s
+        part = self.part
+        z: Array = self._z_of_input @ (input_[part.inputs] - self._k @ state[part.states])
         return z
 
     def subtract_margin(self, z: Array, margin_x: Array, margin_u: Array) -> None:
