@@ -45,7 +45,7 @@ GAIN = 0.002  # γ: an error of f falls to half in some 100 steps; 0.004 costs 6
 # k_0: beside a limit the gain is 1 / (k_0 + k) while that is larger than γ, so the loop begins faster. Elsewhere a gust
 # of half a second at full speed would take f to its largest value, for the whole approach
 FIRST_STEPS = 60.0
-MIN_WIDENING = 0.5  # least f: a bound on what quiet steps alone may take from the distances
+MIN_WIDENING = 0.75  # least f: a bound on what quiet steps alone may take from back-offs and distances
 # First g: the spread grows with the square root of time, so the end of a plan holds for a silence of 4 H steps. What is
 # learnt after the first silence comes too late on a link with long runs of losses
 FIRST_SILENCE_WIDENING = 2.0

@@ -16,10 +16,10 @@
 4. The cost is that of the regulator. With u_t = u_s + K(x_t - x_s) + c_t and the Riccati solution after stage H it is
    |z|² plus a constant, z = L'c, L L' = R + B'PB. If z = 0 keeps all limits within the budgets, it is the answer. Else
    each independent part that violates a limit solves a strictly convex program.
-5. At the levels of observed links the reference moves away from a limit with the age: stage t is flown with information
-   a + t steps old, by the regulator around the reference r_{a+t} of that age, see `reference`. So z = 0 stands for the
-   inputs u_t = u_s + K(x_t - r_{a+t}). The distances keep the risk in the mean of all plans, so rows have no back-offs.
-   Along motions they have back-offs, by the budgets of that link.
+5. At the levels of observed links budgets are those of the link. Where the regulator is quick, the reference moves away
+   from a limit with the age instead: stage t is flown with information a + t steps old, by the regulator around the
+   reference r_{a+t} of that age, see `reference`. So z = 0 stands for the inputs u_t = u_s + K(x_t - r_{a+t}). The
+   distances keep the risk in the mean of all plans, so rows have no back-offs, but along motions.
 """
 
 from __future__ import annotations
@@ -76,6 +76,9 @@ METHOD = "age-conditioned"
 ROUNDS = 2  # rounds of an allocation
 # Rounds if the plan does not keep its back-offs: half of the plans between two near walls need the third.
 MAX_ROUNDS = 3
+# Largest budget of an age at the levels of observed links, as a multiple of the allowed risk: with old ages free, plans
+# in the rooms cost two thirds more at a wall
+MAX_BUDGET_FACTOR = 5.0
 SILENT_STAGES = 2  # stages at the end of a plan that a silence may outlast: a regulator is at its reference in two
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
@@ -170,7 +173,7 @@ class ConditionedSolver:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
-        self._law, self._allowed = law, allowed
+        self._law, self._allowed, self._cov = law, allowed, cov
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
         parts = find_parts(problem, self._slew.d)
         driven = {int(state) for part in parts for state in part.states}
@@ -206,40 +209,45 @@ class ConditionedSolver:
         self._used_margin = np.zeros((steps, width))  # margin of state rows that all parts use so far
         n_parts = len(self._parts)
 
-        def make_allocation(risk: AgeRisk) -> _Allocation:
-            reference_backoffs = np.zeros((1, n_parts, width))
-            reference_backoffs[0][:, self._reference_rows] = compute_reference_backoffs(
-                problem,
-                risk,
-                allowed,
-                self._slew,
-                self._c[self._reference_rows],
-                cov,
-                n_parts,
-                self.filter_plant,
-                bounds_slack=bounds_slack,
-            )
-            return self._make_allocation(risk, reference_backoffs)
-
         deviations = self._select_position_deviations()
-        near = make_allocation(allocate_by_age(link, deviations, allowed, exponent, n_parts))
+        near = self._make_bounded(
+            allocate_by_age(link, deviations, allowed, exponent, n_parts), bounds_slack=bounds_slack
+        )
         # Where a target is far from all limits, limits matter in transit only, and all levels share one allocation.
-        self._transit = make_allocation(allocate_equally(link, steps, allowed, n_parts))
+        self._transit = self._make_bounded(allocate_equally(link, steps, allowed, n_parts), bounds_slack=bounds_slack)
         self._levels = {CONFIGURED_LEVEL: self._make_level(near, self._transit.risk)}
         self._free: _Allocation | None = None
         if has_lower_levels:
-            risk, is_possible = near.risk, np.arange(steps) < self._count_possible_ages(cov, allowed)
-            budgets = np.where(is_possible, allowed, 1.0)
+            self._is_possible = np.arange(steps) < self._count_possible_ages(cov, allowed)
+            risk, budgets = near.risk, np.where(self._is_possible, allowed, 1.0)
             certificate = AgeRisk(self._transit.risk.age_probabilities, 0.0, budgets)
-            self._levels[CERTIFICATE_LEVEL] = self._make_level(make_allocation(certificate), certificate)
+            self._levels[CERTIFICATE_LEVEL] = self._make_level(
+                self._make_bounded(certificate, bounds_slack=bounds_slack), certificate
+            )
             free = replace(risk, budgets=np.ones(steps))
             self._free = self._make_allocation(free, np.zeros((1, n_parts, width)))
-            begins = int(risk.age_probabilities.argmax())
-            last, n_x = begins + COUNTED_HORIZONS * steps, plant.n_x
-            self._error_covs = propagate_covariance(self.filter_plant, last, cov)[begins:, :n_x, :n_x]
+            self._begins = int(risk.age_probabilities.argmax())
+            last, n_x = self._begins + COUNTED_HORIZONS * steps, plant.n_x
+            self._error_covs = propagate_covariance(self.filter_plant, last, cov)[self._begins :, :n_x, :n_x]
             self._reference_programs = self._make_reference_programs()
         self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
         self._cached_backoffs: tuple[tuple[int, int, int, float, float, bytes], _RowBackoffs] | None = None
+
+    def _make_bounded(self, risk: AgeRisk, *, bounds_slack: bool) -> _Allocation:
+        """Make an allocation whose rows have back-offs, and one distance of the reference at all ages."""
+        reference_backoffs = np.zeros((1, len(self._parts), self._rows.size))
+        reference_backoffs[0][:, self._reference_rows] = compute_reference_backoffs(
+            self.problem,
+            risk,
+            self._allowed,
+            self._slew,
+            self._c[self._reference_rows],
+            self._cov,
+            len(self._parts),
+            self.filter_plant,
+            bounds_slack=bounds_slack,
+        )
+        return self._make_allocation(risk, reference_backoffs)
 
     def _make_allocation(self, risk: AgeRisk, reference_backoffs: Array) -> _Allocation:
         steps = self.problem.horizon
@@ -276,24 +284,27 @@ class ConditionedSolver:
         if found is None:
             if self._free is None:
                 raise QuestionError(f"level {level}: the design has the budgets of the configured link alone")
-            allocation = replace(self._free, reference_backoffs=self._find_distances(get_link(level)))
-            found = self._levels[level] = self._make_level(allocation, allocation.risk, self._make_motion(level))
+            link = get_link(level)
+            near = motion = self._make_observed(RunLengthAges(*link, self._begins))
+            if all(program.is_quick(link) for program in self._reference_programs.values()):
+                near = replace(self._free, reference_backoffs=self._find_distances(link))
+            found = self._levels[level] = self._make_level(near, near.risk, motion)
         return found
 
-    def _make_motion(self, level: int) -> _Allocation:
-        """Make the allocation of an observed link along motions: its own, or the certificate's if none exists."""
-        assert self._free is not None, "only levels of observed links are made later"
-        begins = int(self._free.risk.age_probabilities.argmax())
+    def _make_observed(self, link: AgeModel) -> _Allocation:
+        """Make the allocation whose rows keep the budgets of a link; the certificate's if it has none."""
         try:
             risk = allocate_by_age(
-                RunLengthAges(*get_link(level), begins),
+                link,
                 self._select_position_deviations(),
                 self._allowed,
                 n_binding=len(self._parts),
+                max_budget=MAX_BUDGET_FACTOR * self._allowed,
             )
         except DesignError:
             return self._levels[CERTIFICATE_LEVEL].near
-        return self._make_allocation(risk, self._free.reference_backoffs)
+        budgets = np.where(self._is_possible, risk.budgets, 1.0)
+        return self._make_bounded(replace(risk, budgets=budgets), bounds_slack=False)
 
     def _make_reference_programs(self) -> dict[int, ReferenceProgram]:
         """Make the program of each row that limits equilibria; alike rows share one."""
