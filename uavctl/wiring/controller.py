@@ -206,7 +206,9 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         has_lower_levels=adapts,
         bounds_slack=bounds_slack,
     )
-    design_id = make_conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant, bounds_slack=bounds_slack)
+    design_id = make_conditioned_id(
+        problem, link, max_risk, slew_mps3, cov, estimator_plant, adapts=adapts, bounds_slack=bounds_slack
+    )
     return ConditionedDesign(solver, cov, design_id)
 
 

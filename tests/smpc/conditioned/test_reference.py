@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
@@ -90,10 +91,13 @@ def test_links_beyond_the_levels_get_the_nearest_one() -> None:
     assert (find_nearest_link(0.0, 0.0), find_nearest_link(1.0, 1.0)) == (0, last)
 
 
-def test_a_row_that_nothing_disturbs_needs_no_distance() -> None:
-    program = make_reference_program()
-    program._covs = np.zeros_like(program._covs)
-    assert not program.find_distances((0.3, 0.3), ALLOWED).any()
+def test_rows_that_nothing_disturbs_need_no_distance() -> None:
+    problem = make_problem(1)
+    calm = replace(problem, plant=replace(problem.plant, w=0.0 * problem.plant.w))
+    solver = ConditionedSolver(calm, bernoulli(np.array([0.7])), ALLOWED, has_lower_levels=True, bounds_slack=False)
+    answer = solver.solve(0, calm.target, calm.target, Preview(level=get_observed_level(50)))
+    assert answer.offset == 0.0
+    assert not answer.inputs.any()
 
 
 @pytest.fixture(scope="module")

@@ -72,6 +72,7 @@ def make_conditioned_id(
     cov: Array,
     filter_plant: Plant | None,
     *,
+    adapts: bool,
     bounds_slack: bool,
 ) -> str:
     """Return the hash of the arguments of `ConditionedSolver` that its answers depend on, without the target.
@@ -80,8 +81,9 @@ def make_conditioned_id(
     """
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
     parts = METHOD, anywhere, link, allowed, slew_mps3, cov, filter_plant
-    # Recordings of before have the hash without the flag, and the bound.
-    return digest(parts if bounds_slack else (*parts, "slack is not bounded"))
+    flags = (*(["levels of observed links"] if adapts else []), *([] if bounds_slack else ["slack is not bounded"]))
+    # Recordings of before have the hash without flags.
+    return digest((*parts, *flags))
 
 
 def make_conditioned_record(design: ConditionedDesign) -> dict[str, object]:
