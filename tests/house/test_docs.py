@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from docs import PAGES, drawing, topics_page
+from docs import PAGES, campaign_page, drawing, topics_page
 from logs.recording.derived_topics import PLOTS, VIEWS
 from logs.recording.topics import TOPICS
+from uavctl.lab.campaign.spec import read_campaign
 from uavctl.mavlink.handover_states import TRANSITIONS
 
 
@@ -25,15 +27,24 @@ def test_the_drawing_has_every_transition_once() -> None:
     assert "    TAKEN_OVER --> RETURNING: engage" in lines
 
 
+def test_the_campaign_of_the_page_is_read(tmp_path: Path) -> None:
+    (block,) = re.findall(r"^```toml\n(.*?)^```$", campaign_page(), re.MULTILINE | re.DOTALL)
+    path = tmp_path / "mine.toml"
+    path.write_text(block, encoding="utf-8")
+    campaign, _ = read_campaign(path)
+    assert [one.kind for one in campaign.spec.controller] == ["smpc"]
+
+
 def test_page_lists_every_topic_and_field() -> None:
     page = topics_page()
     for topic in TOPICS:
         assert page.count(f"| `{topic.name}` |") == 1
-        section = page.split(f"## `{topic.name}`")[1].split("## ")[0]
+        section = " ".join(page.split(f"## `{topic.name}`")[1].split("## ")[0].split())
         for field in msgspec.structs.fields(topic.record):
-            assert f"| `{field.name}` |" in section
-    assert "| `position_m` | array of number |" in page
-    assert "| `solve` | `SolveStatus` or null |" in page
+            assert re.search(rf"(Fields:|;) `{field.name}` \S", section)
+    words = " ".join(page.split())
+    assert "; `position_m` array of number;" in words
+    assert "; `solve` `SolveStatus` or null;" in words
 
 
 def test_page_lists_every_topic_for_viewers_and_every_field_to_plot() -> None:
@@ -41,6 +52,6 @@ def test_page_lists_every_topic_for_viewers_and_every_field_to_plot() -> None:
     for view in VIEWS:
         assert page.count(f"| `{view.name}` | `{view.schema_name}` |") == 1
     for kind, name in PLOTS.items():
-        section = page.split(f"## `{name}`")[1].split("## ")[0]
+        section = " ".join(page.split(f"## `{name}`")[1].split("## ")[0].split())
         for field in msgspec.structs.fields(kind):
-            assert f"| `{field.name}` |" in section
+            assert re.search(rf"(Fields:|;) `{field.name}` \S", section)
