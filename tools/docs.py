@@ -155,7 +155,7 @@ def topics_page() -> str:
     for topic in TOPICS:
         properties = msgspec.json.decode(get_definition(topic.name).schema)["properties"]
         fields = {name: _json_type(schema) for name, schema in properties.items()}
-        lines += _list_fields(topic.name, topic.record, fields)
+        lines += _list_fields(topic.name, fields)
     return "\n".join([*lines, *_views_section()])
 
 
@@ -175,14 +175,14 @@ def _views_section() -> list[str]:
     for view in VIEWS:
         if issubclass(view.kind, Record):
             fields = {field.name: field.type.__name__ for field in msgspec.structs.fields(view.kind)}
-            lines += _list_fields(view.name, view.kind, fields)
+            lines += _list_fields(view.name, fields)
     return lines
 
 
-def _list_fields(topic: str, record: type[Record], fields: dict[str, str]) -> list[str]:
-    """Return the section of a topic: its record in a sentence, and the fields with their types."""
+def _list_fields(topic: str, fields: dict[str, str]) -> list[str]:
+    """Return the section of a topic: its fields with their types."""
     text = "; ".join(f"`{name}` {kind}" for name, kind in fields.items())
-    return [f"## `{topic}`", "", (record.__doc__ or "").strip(), "", *wrap(f"Fields: {text}.", 120), ""]
+    return [f"## `{topic}`", "", *wrap(f"Fields: {text}.", 120), ""]
 
 
 def _json_type(schema: dict[str, object]) -> str:
