@@ -84,7 +84,8 @@ Each `set` is a list of overrides of the flight [configuration](configuration.md
 """
 _FLIGHTS = """# Keys of a campaign of flights
 
-With `world = "quadrotor"` a campaign flies the simulated quadrotor. Its file has these keys instead.
+With `world = "quadrotor"` a campaign flies the simulated quadrotor. Its file has these keys instead; `[[link]]` is as
+above.
 """
 _RAW_TEXT = "datagrams of connection `<link>`; log time is the time of receiving or sending"
 
@@ -127,7 +128,10 @@ def _default(field: FieldInfo, section: type[Section], path: str) -> str:
 
 def campaign_page() -> str:
     """The page docs/campaign-keys.md, made from the types of the two kinds of campaign."""
-    return "\n".join((_CAMPAIGN, *tables(CampaignSpec, ""), _FLIGHTS, *tables(TrialSpec, "")))
+    keys, flights = ("\n".join(tables(spec, "")).split("\n## ") for spec in (CampaignSpec, TrialSpec))
+    known = {section.strip() for section in keys}
+    flights = [section for section in flights if section.strip() not in known]
+    return "\n".join((_CAMPAIGN, "\n## ".join(keys), _FLIGHTS, "\n## ".join(flights)))
 
 
 def topics_page() -> str:

@@ -8,10 +8,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from docs import PAGES, campaign_page, drawing, topics_page
+from docs import PAGES, drawing, topics_page
 from logs.recording.derived_topics import PLOTS, VIEWS
 from logs.recording.topics import TOPICS
-from uavctl.lab.campaign.spec import read_campaign
 from uavctl.mavlink.handover_states import TRANSITIONS
 
 
@@ -25,14 +24,6 @@ def test_the_drawing_has_every_transition_once() -> None:
     transitions = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
     assert sum("-->" in line for line in lines) == len(transitions) + 3  # the beginning, two ends
     assert "    TAKEN_OVER --> RETURNING: engage" in lines
-
-
-def test_the_campaign_of_the_page_is_read(tmp_path: Path) -> None:
-    (block,) = re.findall(r"^```toml\n(.*?)^```$", campaign_page(), re.MULTILINE | re.DOTALL)
-    path = tmp_path / "mine.toml"
-    path.write_text(block, encoding="utf-8")
-    campaign, _ = read_campaign(path)
-    assert [one.kind for one in campaign.spec.controller] == ["smpc"]
 
 
 def test_page_lists_every_topic_and_field() -> None:
