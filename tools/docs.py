@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from textwrap import wrap
 from typing import cast
 
 import msgspec
 from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo
 
-from logs.recording.derived_topics import VIEWS, DerivedTopic
+from logs.recording.derived_topics import VIEWS
 from logs.recording.topics import TOPICS, get_definition
 from uavctl.cli.app import app
 from uavctl.config.document import Section, describe_type, get_description, get_element_type, is_section
@@ -67,15 +68,26 @@ _CAMPAIGN = """# Keys of a campaign
 
 This page is generated from the types in `uavctl/lab/campaign` (`make docs`); do not edit it.
 
-A campaign is a TOML file; `docs/campaigns/` has complete ones, and [campaigns.md](campaigns.md) says how to fly and
-read them. Every `set` is a list of overrides of the flight configuration, as `--set` takes them
-([configuration.md](configuration.md)).
+A campaign is a TOML file. `docs/campaigns/` has complete ones; [campaigns](campaigns.md) runs and reads them. The
+shortest one:
+
+```toml
+name = "mine"
+config = "paper"
+
+[[controller]]
+name = "ours"
+kind = "smpc"
+```
+
+Each `set` is a list of overrides of the flight [configuration](configuration.md), as for `--set`.
 """
 _FLIGHTS = """# Keys of a campaign of flights
 
-With `world = "quadrotor"` a campaign flies the true vehicle, and its file has these keys instead.
+With `world = "quadrotor"` a campaign flies the simulated quadrotor. Its file has these keys instead; `[[link]]` is as
+above.
 """
-_RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time = time of crossing"
+_RAW_TEXT = "datagrams of connection `<link>`; log time is the time of receiving or sending"
 
 
 def configuration_page() -> str:
@@ -116,7 +128,10 @@ def _default(field: FieldInfo, section: type[Section], path: str) -> str:
 
 def campaign_page() -> str:
     """The page docs/campaign-keys.md, made from the types of the two kinds of campaign."""
-    return "\n".join((_CAMPAIGN, *tables(CampaignSpec, ""), _FLIGHTS, *tables(TrialSpec, "")))
+    keys, flights = ("\n".join(tables(spec, "")).split("\n## ") for spec in (CampaignSpec, TrialSpec))
+    known = {section.strip() for section in keys}
+    flights = [section for section in flights if section.strip() not in known]
+    return "\n".join((_CAMPAIGN, "\n## ".join(keys), _FLIGHTS, "\n## ".join(flights)))
 
 
 def topics_page() -> str:
@@ -124,22 +139,27 @@ def topics_page() -> str:
     lines = [
         "# Topics of a recording",
         "",
-        "MCAP, log times in UTC; times in the records (`at_ns` ...) are nanoseconds of the recorder's monotonic clock,",
-        "and the metadata `zero_utc_ns` of each channel is the UTC of that clock's zero",
-        "([recordings.md](recordings.md#times)). Numbers are written with the digits that give the same float back;",
-        'NaN and infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`; `null` is only ever a missing value.',
+        "This page lists the topics of an MCAP file and their fields. To see those of a recording:",
         "",
-        "| topic | record | encoding | what it is |",
-        "|---|---|---|---|",
-        f"| `/raw/<link>/in`, `/raw/<link>/out` | `Datagram` | mavlink | {_RAW_TEXT} |",
-        *(f"| `{topic.name}` | `{topic.record.__name__}` | json | {topic.text} |" for topic in TOPICS),
+        "```sh",
+        "uavctl log info FLIGHT",
+        "```",
+        "",
+        "Records are JSON, with their schemas in the file; raw topics are MAVLink. [Times](recordings.md#times) in",
+        "records are nanoseconds of a monotonic clock. Numbers have the digits that give the same float back. NaN and",
+        'infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`; `null` is a missing value. This page is',
+        "generated (`make docs`).",
+        "",
+        "| topic | record | content |",
+        "|---|---|---|",
+        f"| `/raw/<link>/in`, `/raw/<link>/out` | `Datagram` | {_RAW_TEXT} |",
+        *(f"| `{topic.name}` | `{topic.record.__name__}` | {topic.text} |" for topic in TOPICS),
         "",
     ]
     for topic in TOPICS:
-        lines += [f"## `{topic.name}`", "", (topic.record.__doc__ or "").strip(), "", "| field | type |", "|---|---|"]
         properties = msgspec.json.decode(get_definition(topic.name).schema)["properties"]
-        lines += [f"| `{name}` | {_json_type(schema)} |" for name, schema in properties.items()]
-        lines.append("")
+        fields = {name: _json_type(schema) for name, schema in properties.items()}
+        lines += _list_fields(topic.name, fields)
     return "\n".join([*lines, *_views_section()])
 
 
@@ -147,34 +167,26 @@ def _views_section() -> list[str]:
     lines = [
         "# Topics for viewers",
         "",
-        "Made from the records above while they are written, for programs that show recordings",
-        "([viewers.md](viewers.md) says how to open one); protobuf, with the schemas inside the file. A replay and a",
-        "report never read them. Places are local NED, in the frame `ned`; the frame `room` (axes: east, north, up)",
-        "is the one to look from. Log times are those of the records. NaN: there is no number.",
+        "These topics are made from the records above for [viewers](viewers.md), as protobuf. No replay and no",
+        "report reads them. Positions are local NED, in frame `ned`; look from frame `room` (east, north, up). NaN: no",
+        "number.",
         "",
-        "| topic | schema | what it is |",
+        "| topic | schema | content |",
         "|---|---|---|",
         *(f"| `{view.name}` | `{view.schema_name}` | {view.text} |" for view in VIEWS),
         "",
     ]
     for view in VIEWS:
         if issubclass(view.kind, Record):
-            lines += _message_section(view, view.kind)
+            fields = {field.name: field.type.__name__ for field in msgspec.structs.fields(view.kind)}
+            lines += _list_fields(view.name, fields)
     return lines
 
 
-def _message_section(view: DerivedTopic, kind: type[Record]) -> list[str]:
-    fields = msgspec.structs.fields(kind)
-    return [
-        f"## `{view.name}`",
-        "",
-        (kind.__doc__ or "").strip(),
-        "",
-        "| field | type |",
-        "|---|---|",
-        *(f"| `{field.name}` | `{field.type.__name__}` |" for field in fields),
-        "",
-    ]
+def _list_fields(topic: str, fields: dict[str, str]) -> list[str]:
+    """Return the section of a topic: its fields with their types."""
+    text = "; ".join(f"`{name}` {kind}" for name, kind in fields.items())
+    return [f"## `{topic}`", "", *wrap(f"Fields: {text}.", 120), ""]
 
 
 def _json_type(schema: dict[str, object]) -> str:

@@ -3,7 +3,7 @@
 1. `mutants.find_mutants` lists the changes of a module.
 2. `find_survivors` runs the tests against each change in a fork that has imported all but this project. The first test
    that fails ends the run: the change is killed. A change that all tests pass survives.
-3. docs/safety-core.md gives a reason for each survivor. A survivor without a reason fails the run, and so does a reason
+3. tools/survivors.md gives a reason for each survivor. A survivor without a reason fails the run, and so does a reason
    without its survivor.
 """
 
@@ -30,7 +30,7 @@ import scipy.spatial.transform  # noqa: F401
 from mutants import Mutant, Row, find_mutants
 from safety_core import ROOT, TARGETS
 
-PAGE = ROOT / "docs" / "safety-core.md"
+PAGE = ROOT / "tools" / "survivors.md"
 CPU_S = 60  # of one mutant's tests, which take a few: a change may make a loop endless
 
 

@@ -1,4 +1,4 @@
-"""docs/faults.md: each row is shown by tests that carry its number; the files that it names are among them."""
+"""docs/faults.md: each row is shown by tests that carry its number."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def find_marking_files() -> dict[int, set[str]]:
 
 @cache
 def read_rows() -> dict[int, tuple[str, ...]]:
-    """Cells of each row: fault, reaction, shown in."""
+    """Cells of each row: fault, reaction."""
     lines = PAGE.read_text(encoding="utf-8").splitlines()
     rows = [re.split(r"\s*\|\s*", line.strip("| ")) for line in lines if re.match(r"\| \d+ \|", line)]
     assert len({row[0] for row in rows}) == len(rows), "a number twice"
@@ -56,17 +56,13 @@ def read_rows() -> dict[int, tuple[str, ...]]:
 def test_the_page_has_every_row_in_order_and_complete() -> None:
     rows = read_rows()
     assert list(rows) == list(NUMBERS)
-    assert all(len(cells) == 3 and all(cells) for cells in rows.values())
+    assert all(len(cells) == 2 and all(cells) for cells in rows.values())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", NUMBERS)
-def test_each_row_has_its_tests_in_the_named_files(row: int) -> None:
-    shown_by = find_marking_files()[row]
-    assert shown_by, f"no test is marked with fault({row})"
-    named = set(re.findall(r"`(\w+)`", read_rows()[row][2]))
-    assert named
-    assert named <= shown_by, f"row {row} is shown by {sorted(shown_by)}"
+def test_each_row_has_its_tests(row: int) -> None:
+    assert find_marking_files()[row], f"no test is marked with fault({row})"
 
 
 def test_marks_are_found_as_pytest_finds_them() -> None:

@@ -66,7 +66,7 @@ TRUE_LINK = "true"  # a controller that believes in the link it flies on
 
 MeasuredQuantity = Literal["state", "position"]
 DisturbanceKind = Literal["gaussian", "uniform", "heavy", "gusts"]
-Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
+Name = Annotated[str, Meta(min_length=1, max_length=60, description="name in tables and plots")]
 Overrides = Annotated[tuple[str, ...], Meta(max_length=100)]
 MAX_TABLES = 100
 MAX_DESIGNS, MAX_CELLS = 200, 10_000
@@ -83,21 +83,21 @@ class ControllerSpec(Section, frozen=True, kw_only=True):
     kind: Annotated[
         str,
         declare(
-            f"what it is: {', '.join(f'`{kind}`' for kind in KINDS)}; or a controller of another package, "
-            "by the name of its entry point `uavctl.controllers` or as `module:Class`",
+            f"{', '.join(f'`{kind}`' for kind in KINDS)}; or a controller of another package, "
+            "by its entry point `uavctl.controllers` or as `module:Class`",
             length=(1, 200),
         ),
     ]
-    set: Annotated[Overrides, declare("overrides of the configuration that it is designed from: what it believes")] = ()
+    set: Annotated[Overrides, declare("overrides of the configuration that it is designed from")] = ()
     link: Annotated[
-        str, declare("the link that it believes in: `true`, the one it flies on, or the name of a [[link]]")
+        str, declare("the link that it is designed for: `true`, the one it flies on, or the name of a [[link]]")
     ] = TRUE_LINK
     margin: Annotated[
         float,
         declare(
-            "with `packetised`, `hold-last` and `zero-on-loss`: how far plans keep from the state limits, in "
-            "standard deviations of one step's disturbance; with `mean-qp` and `governor`: in those of a "
-            "prediction as old as the stage",
+            "distance of plans from the state limits, in standard deviations: of one step's disturbance "
+            "(`packetised`, `hold-last`, `zero-on-loss`), or of a prediction as old as the stage (`mean-qp`, "
+            "`governor`)",
             "",
             0,
             1000,
@@ -129,17 +129,17 @@ class DisturbanceSpec(Section, frozen=True, kw_only=True):
 
 
 class PlantSpec(Section, frozen=True, kw_only=True):
-    """One plant that is flown; the controllers go on believing in the configuration's."""
+    """One plant that is flown; controllers are designed for the configuration's."""
 
     name: Name
     set: Annotated[Overrides, declare("overrides of the configuration's [plant]")] = ()
 
 
 class TuningSpec(Section, frozen=True, kw_only=True):
-    """Settings that differ for some controllers on the links that they believe in."""
+    """Settings that differ for some controllers on the links that they are designed for."""
 
     controllers: Annotated[tuple[str, ...], declare("names of [[controller]]s", length=(1, MAX_TABLES))]
-    links: Annotated[tuple[str, ...], declare("names of [[link]]s that they believe in", length=(1, MAX_TABLES))]
+    links: Annotated[tuple[str, ...], declare("names of [[link]]s that they are designed for", length=(1, MAX_TABLES))]
     set: Annotated[Overrides, declare("overrides of the design; they win over the controller's")] = ()
     margin: Annotated[
         Annotated[float, Meta(ge=0, le=1000)] | None,
@@ -153,7 +153,7 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     name: Annotated[
         str, declare("name of the campaign; part of its folder's name", pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$")
     ]
-    config: Annotated[str, declare("flight configuration: a preset, or a file, seen from the campaign's")]
+    config: Annotated[str, declare("flight configuration: a preset, or a file relative to the campaign's")]
     set: Annotated[Overrides, declare("overrides of the configuration, for all")] = ()
     steps: Annotated[int, declare("steps of a run", "", 2, 100_000)] = 50
     runs: Annotated[int, declare("runs of each cell", "", 1, MAX_RUNS)] = 1000
@@ -161,9 +161,9 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     measured: Annotated[
         MeasuredQuantity,
         declare(
-            "what a controller is told of a step whose position comes: `state`, all of it, exactly; or "
-            "`position`, with the noise of `sim.camera.noise_std_m`, of which the flight's filter (its "
-            "`[estimator]`, without a bias) makes state and covariance"
+            "measurement of a step whose position arrives: the exact `state`; or `position`, with the noise of "
+            "`sim.camera.noise_std_m`, from which the flight's filter (`[estimator]`, without a bias) makes "
+            "state and covariance"
         ),
     ] = "state"
     start: Annotated[Floats, declare("state (n_x) in which every run starts; else sim.start_*", length=MAX_STATES)] = ()

@@ -82,12 +82,12 @@ class TrialSpec(Section, frozen=True, kw_only=True):
         str, declare("name of the campaign; part of its folder's name", pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$")
     ]
     world: Annotated[Literal["quadrotor"], declare("`quadrotor`: rigid body, rotors, wind and an autopilot's loops")]
-    config: Annotated[str, declare("flight configuration: a preset, or a file, seen from the campaign's")]
+    config: Annotated[str, declare("flight configuration: a preset, or a file relative to the campaign's")]
     set: Annotated[Overrides, declare("overrides of the configuration, for all")] = ()
     runs: Annotated[int, declare("flights of each cell", "", 1, MAX_TRIALS)] = 20
     master: Annotated[int, declare("seed: flight i's draws come from (master, i), in every cell", "", 0, MAX_SEED)] = 0
     seconds: Annotated[float, declare("length of a flight; a figure of eight has its own", "s", 1, 3600)] = 40.0
-    from_s: Annotated[float, declare("from when on the target is to be held", "s", 0, 3600)] = 10.0
+    from_s: Annotated[float, declare("start of the time in which the target is held", "s", 0, 3600)] = 10.0
     scenario: Annotated[
         tuple[Scenario, ...],
         declare(
@@ -96,9 +96,7 @@ class TrialSpec(Section, frozen=True, kw_only=True):
             length=(1, 3),
         ),
     ] = SCENARIOS
-    autopilot: Annotated[tuple[AutopilotName, ...], declare("whose behaviour the vehicle shows", length=(1, 2))] = (
-        AUTOPILOTS
-    )
+    autopilot: Annotated[tuple[AutopilotName, ...], declare("autopilots of the vehicle", length=(1, 2))] = AUTOPILOTS
     rate_hz: Annotated[
         tuple[Rate, ...], declare("positions a second that the cameras give", "1/s", length=(1, MAX_TABLES))
     ] = (5.0, 50.0)
@@ -109,7 +107,7 @@ class TrialSpec(Section, frozen=True, kw_only=True):
             length=(1, 3),
         ),
     ] = ("gusts",)
-    controller: Annotated[tuple[TrialControllerSpec, ...], declare("who flies", length=(1, MAX_TABLES))]
+    controller: Annotated[tuple[TrialControllerSpec, ...], declare("controllers", length=(1, MAX_TABLES))]
     link: Annotated[tuple[LinkSpec, ...], declare("links", length=(1, MAX_TABLES))] = (LinkSpec(name="as configured"),)
 
 
