@@ -240,8 +240,7 @@ class RiskConfig(Section, frozen=True, kw_only=True):
         Literal["certificate", "observed", "configured"],
         declare(
             "risk of each age, with scheme `age-conditioned`: `certificate` holds on any link; `observed` "
-            "begins with it, and gives more to ages that the link shows to be rare; `configured` holds on a "
-            "link as in `[link]`"
+            "begins with it, and then counts on the link as observed; `configured` holds on a link as in `[link]`"
         ),
     ] = "observed"
     adapt: Annotated[

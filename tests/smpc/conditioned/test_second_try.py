@@ -12,7 +12,7 @@ from uavctl.arrays import Array
 from uavctl.config.load import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Preview
-from uavctl.smpc.conditioned import planner
+from uavctl.smpc.conditioned import levels, planner
 from uavctl.smpc.conditioned.backoffs import allocate_equally
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import PartProgram
@@ -40,7 +40,7 @@ def solver() -> ConditionedSolver:
     )
     with pytest.MonkeyPatch.context() as patch:
         risk = allocate_equally(bernoulli(np.array([0.7])), len(BUDGETS), 0.05, 2)
-        patch.setattr(planner, "allocate_by_age", lambda *_: replace(risk, budgets=np.array(BUDGETS)))
+        patch.setattr(levels, "allocate_by_age", lambda *_: replace(risk, budgets=np.array(BUDGETS)))
         # Bounded, the widening of STATE makes another program.
         patch.setattr(planner, "find_opposite_rows", lambda c: np.zeros((0, 2), dtype=np.intp))
         return ConditionedSolver(problem, bernoulli(np.array([0.7])), 0.05)

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -49,24 +48,19 @@ from uavctl.smpc.batch import Decisions, gather_answers
 from uavctl.smpc.conditioned.adaptation import AgePrior
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
-    DISTANT_SHARE,
     MAX_RISK,
     AgeRisk,
     Flags,
     RowDeviations,
-    allocate_by_age,
-    allocate_equally,
     bound_widening,
-    compute_quantile,
-    compute_reference_backoffs,
     compute_violation_risk,
     find_binding,
     find_opposite_rows,
     reallocate_to_rows,
 )
+from uavctl.smpc.conditioned.levels import Allocation, RiskLevels
 from uavctl.smpc.conditioned.program import PartProgram, ReferenceEquilibria, RegulatedRows, SlewRows
-from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, COUNTED_HORIZONS, ReferenceProgram, get_link
-from uavctl.smpc.link import AgeModel, RunLengthAges
+from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import OPEN
@@ -76,9 +70,6 @@ METHOD = "age-conditioned"
 ROUNDS = 2  # rounds of an allocation
 # Rounds if the plan does not keep its back-offs: half of the plans between two near walls need the third.
 MAX_ROUNDS = 3
-# Largest budget of an age at the levels of observed links, as a multiple of the allowed risk: with old ages free, plans
-# in the rooms cost two thirds more at a wall
-MAX_BUDGET_FACTOR = 5.0
 SILENT_STAGES = 2  # stages at the end of a plan that a silence may outlast: a regulator is at its reference in two
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
@@ -92,34 +83,10 @@ class _RowBackoffs(msgspec.Struct, frozen=True, eq=False):
     distant_quantiles: Array  # most standard deviations (H, 1) of rows that the regulator's plan is not near, at first
 
 
-@dataclass(frozen=True, eq=False)
-class _Allocation:
-    """Allocation of the risk to the ages, and what follows from it for each age of a position [steps]."""
-
-    risk: AgeRisk  # the budgets
-    budgets: Array  # ε̄ of the stages (H, H)
-    quantiles: Array  # quantiles of rows that share the budgets equally (H, H, 1)
-    distant_quantiles: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
-    # Distance of the reference from each row (A, n, m), by the age and the number of rows that limit a target. It does
-    # not fall with age, and the last one is that of a plan at rest
-    reference_backoffs: Array
-
-
-@dataclass(frozen=True, eq=False)
-class RiskLevel:
-    """Allocations of one level of the budgets."""
-
-    near: _Allocation  # beside limits
-    motion: _Allocation  # along motions, whose plans meet limits at any age
-    transit: _Allocation  # where the target is far from all limits
-    far: Array  # distance (m,) of a target from each row beyond which it is far from it
-    transit_bounds: Array  # bounds on a target far from limits, without limits of a preview and widening
-
-
 class _Rest(msgspec.Struct, frozen=True, eq=False):
     """Where a plan to a target rests, and what follows from it for any state."""
 
-    allocation: _Allocation  # allocation of the risk
+    allocation: Allocation  # allocation of the risk
     reference: Array  # equilibrium that the plan ends in (n_x,)
     sides: Array  # right sides of the state rows minus their values at the reference, (H, m) or (m,)
     equilibrium_input: Array | None  # input there (n_u,); None for zero
@@ -173,7 +140,7 @@ class ConditionedSolver:
         self.problem = problem
         self.filter_plant = problem.plant if filter_plant is None else filter_plant
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
-        self._law, self._allowed, self._cov = law, allowed, cov
+        self._law = law
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
         parts = find_parts(problem, self._slew.d)
         driven = {int(state) for part in parts for state in part.states}
@@ -207,138 +174,35 @@ class ConditionedSolver:
         self._margins = np.full(width * steps + hard + 1, OPEN)
         self._margins_x = self._margins[: width * steps].reshape(steps, width)
         self._used_margin = np.zeros((steps, width))  # margin of state rows that all parts use so far
-        n_parts = len(self._parts)
-
-        deviations = self._select_position_deviations()
-        near = self._make_bounded(
-            allocate_by_age(link, deviations, allowed, exponent, n_parts), bounds_slack=bounds_slack
-        )
-        # Where a target is far from all limits, limits matter in transit only, and all levels share one allocation.
-        self._transit = self._make_bounded(allocate_equally(link, steps, allowed, n_parts), bounds_slack=bounds_slack)
-        self._levels = {CONFIGURED_LEVEL: self._make_level(near, self._transit.risk)}
-        self._free: _Allocation | None = None
-        if has_lower_levels:
-            self._is_possible = np.arange(steps) < self._count_possible_ages(cov, allowed)
-            risk, budgets = near.risk, np.where(self._is_possible, allowed, 1.0)
-            certificate = AgeRisk(self._transit.risk.age_probabilities, 0.0, budgets)
-            self._levels[CERTIFICATE_LEVEL] = self._make_level(
-                self._make_bounded(certificate, bounds_slack=bounds_slack), certificate
-            )
-            free = replace(risk, budgets=np.ones(steps))
-            self._free = self._make_allocation(free, np.zeros((1, n_parts, width)))
-            self._begins = int(risk.age_probabilities.argmax())
-            last, n_x = self._begins + COUNTED_HORIZONS * steps, plant.n_x
-            self._error_covs = propagate_covariance(self.filter_plant, last, cov)[self._begins :, :n_x, :n_x]
-            self._reference_programs = self._make_reference_programs()
-        self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
-        self._cached_backoffs: tuple[tuple[int, int, int, float, float, bytes], _RowBackoffs] | None = None
-
-    def _make_bounded(self, risk: AgeRisk, *, bounds_slack: bool) -> _Allocation:
-        """Make an allocation whose rows have back-offs, and one distance of the reference at all ages."""
-        reference_backoffs = np.zeros((1, len(self._parts), self._rows.size))
-        reference_backoffs[0][:, self._reference_rows] = compute_reference_backoffs(
-            self.problem,
-            risk,
-            self._allowed,
+        self._levels = RiskLevels(
+            problem,
+            law,
+            [program.part for program in self._parts],
+            self._equilibria,
+            self._rows,
+            self._reference_rows,
+            self._deviations,
             self._slew,
-            self._c[self._reference_rows],
-            self._cov,
-            len(self._parts),
+            link,
+            allowed,
+            exponent,
+            cov,
             self.filter_plant,
+            has_lower_levels=has_lower_levels,
             bounds_slack=bounds_slack,
         )
-        return self._make_allocation(risk, reference_backoffs)
-
-    def _make_allocation(self, risk: AgeRisk, reference_backoffs: Array) -> _Allocation:
-        steps = self.problem.horizon
-        # Row a, column t - 1: index of the budget of stage t of a plan from a position of age a
-        ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-        budgets = risk.row_budgets[ages]
-        equal_budgets = budgets / max(1, self._rows.size)
-        return _Allocation(
-            risk,
-            budgets,
-            compute_quantile(equal_budgets)[:, :, None],
-            compute_quantile(DISTANT_SHARE * equal_budgets)[:, :, None],
-            reference_backoffs,
-        )
-
-    def _make_level(self, near: _Allocation, risk: AgeRisk, motion: _Allocation | None = None) -> RiskLevel:
-        """Make a level.
-
-        Args:
-            risk: Risk by age whose oldest age with a back-off decides which targets are far from limits.
-            motion: Allocation along motions; None: `near`.
-        """
-        # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
-        counts = int(np.count_nonzero(risk.budgets < 1.0))
-        oldest = self._deviations.compute(None)[max(0, counts - 1)]
-        share = np.array(self._allowed / len(self._parts))
-        distance = np.maximum(self._transit.reference_backoffs[-1, -1], near.reference_backoffs[-1, -1])
-        far = np.maximum(distance, float(compute_quantile(share)) * oldest)
-        return RiskLevel(near, motion or near, self._transit, far, transit_bounds=(self._b - far)[self._reference_rows])
-
-    def _get_level(self, level: int) -> RiskLevel:
-        """Return a level; that of an observed link is made when it is asked for first."""
-        found = self._levels.get(level)
-        if found is None:
-            if self._free is None:
-                raise QuestionError(f"level {level}: the design has the budgets of the configured link alone")
-            link = get_link(level)
-            near = motion = self._make_observed(RunLengthAges(*link, self._begins))
-            if all(program.is_quick(link) for program in self._reference_programs.values()):
-                near = replace(self._free, reference_backoffs=self._find_distances(link))
-            found = self._levels[level] = self._make_level(near, near.risk, motion)
-        return found
-
-    def _make_observed(self, link: AgeModel) -> _Allocation:
-        """Make the allocation whose rows keep the budgets of a link; the certificate's if it has none."""
-        try:
-            risk = allocate_by_age(
-                link,
-                self._select_position_deviations(),
-                self._allowed,
-                n_binding=len(self._parts),
-                max_budget=MAX_BUDGET_FACTOR * self._allowed,
-            )
-        except DesignError:
-            return self._levels[CERTIFICATE_LEVEL].near
-        budgets = np.where(self._is_possible, risk.budgets, 1.0)
-        return self._make_bounded(replace(risk, budgets=budgets), bounds_slack=False)
-
-    def _make_reference_programs(self) -> dict[int, ReferenceProgram]:
-        """Make the program of each row that limits equilibria; alike rows share one."""
-        programs: dict[int, ReferenceProgram] = {}
-        shared: dict[bytes, ReferenceProgram] = {}
-        for part in self._parts:
-            for row in np.intersect1d(np.arange(self._rows.size)[part.columns], self._reference_rows):
-                program = ReferenceProgram(
-                    self.problem, self._law, part.part, self._equilibria, self._c[row], self._error_covs
-                )
-                programs[int(row)] = shared.setdefault(program.key, program)
-        return programs
-
-    def _find_distances(self, link: tuple[float, float]) -> Array:
-        """Find the distances (H, n, m) of the reference by age from each row, for 1 … n rows that share the risk."""
-        n_parts = len(self._parts)
-        distances = np.zeros((self.problem.horizon, n_parts, self._rows.size))
-        for n_rows in range(1, n_parts + 1):
-            of_program: dict[ReferenceProgram, Array] = {}
-            for row, program in self._reference_programs.items():
-                if program not in of_program:
-                    of_program[program] = program.find_distances(link, self._allowed / n_rows)
-                distances[:, n_rows - 1, row] = of_program[program]
-        return distances
+        self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
+        self._cached_backoffs: tuple[tuple[int, int, int, float, float, bytes], _RowBackoffs] | None = None
 
     @property
     def risk(self) -> AgeRisk:
         """Risk by age near limits and along motions."""
-        return self._levels[CONFIGURED_LEVEL].near.risk
+        return self._levels.get(CONFIGURED_LEVEL).near.risk
 
     @property
     def transit_risk(self) -> AgeRisk:
         """Risk by age where the target is far from all limits."""
-        return self._transit.risk
+        return self._levels.transit.risk
 
     def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
@@ -349,7 +213,7 @@ class ConditionedSolver:
     def compute_reference_limits(self) -> Array:
         """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self._levels[CONFIGURED_LEVEL].near.reference_backoffs[-1, -1]
+        sides[self._rows] -= self._levels.get(CONFIGURED_LEVEL).near.reference_backoffs[-1, -1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
@@ -445,7 +309,7 @@ class ConditionedSolver:
         The reference of an age is on the line from the target to the reference `rest` of a plan at rest, where the rows
         that limit it keep the distances of the age.
         """
-        if len(self._get_level(preview.level).near.reference_backoffs) == 1 or preview.path is not None:
+        if len(self._levels.get(preview.level).near.reference_backoffs) == 1 or preview.path is not None:
             return ()
         sides = limits if limits.ndim == 1 else limits.min(axis=0)
         count = self._count_limits(target, sides, preview)
@@ -468,7 +332,7 @@ class ConditionedSolver:
 
     def _widen_distances(self, count: int, preview: Preview) -> Array:
         """Return the distances (A, m) by age of a target that `count` rows limit: the last ones hold for a silence."""
-        backoffs = self._get_level(preview.level).near.reference_backoffs
+        backoffs = self._levels.get(preview.level).near.reference_backoffs
         distances: Array = preview.widening * backoffs[:, min(count, len(self._parts)) - 1]
         if len(distances) > 1:
             distances[-SILENT_STAGES:] *= preview.silence_widening
@@ -476,7 +340,7 @@ class ConditionedSolver:
 
     def _count_limits(self, target: Array, sides: Array, preview: Preview) -> int:
         """Count the rows that limit a target: those that are nearer than one row alone would keep."""
-        backoffs = self._get_level(preview.level).near.reference_backoffs[-1, 0]
+        backoffs = self._levels.get(preview.level).near.reference_backoffs[-1, 0]
         kept = (sides - preview.widening * backoffs)[self._reference_rows]
         return int(np.count_nonzero(self._equilibrium_rows.dot(target[self._equilibria.held]) > kept))
 
@@ -487,13 +351,13 @@ class ConditionedSolver:
             limits = preview.limits[1:] if self._in_order else preview.limits[1:, self._rows]
         return limits
 
-    def _select_allocation(self, target_rows: Array, limits: Array, preview: Preview) -> _Allocation:
+    def _select_allocation(self, target_rows: Array, limits: Array, preview: Preview) -> Allocation:
         """Select the allocation of a plan, by data that do not depend on the age: all ages must share one.
 
         Args:
             target_rows: Values of the rows of resting places at the target.
         """
-        level = self._get_level(preview.level)
+        level = self._levels.get(preview.level)
         if preview.path is not None:
             return level.motion
         kept = level.transit_bounds
@@ -502,7 +366,7 @@ class ConditionedSolver:
             kept = (sides - preview.widening * level.far)[self._reference_rows]
         return level.transit if np.count_nonzero(target_rows <= kept) == kept.size else level.near
 
-    def _find_row_backoffs(self, allocation: _Allocation, preview: Preview) -> _RowBackoffs:
+    def _find_row_backoffs(self, allocation: Allocation, preview: Preview) -> _RowBackoffs:
         """Return the first back-offs of a plan from a position of age a; the last ones are cached, by their bits.
 
         The age acts twice. It selects the budget of each stage, as stage t has information a + t steps old. And the
@@ -533,26 +397,6 @@ class ConditionedSolver:
         for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference
-
-    def _count_possible_ages(self, cov: Array | None, allowed: float) -> int:
-        """Count the ages at which all rows can keep an equal share of the allowed risk between opposite limits.
-
-        At older ages the certificate keeps nothing back: no plan could.
-        """
-        sigma = self._deviations.compute(cov)
-        needed = float(compute_quantile(np.array(allowed / max(1, self._rows.size)))) * sigma
-        # β_ti + β_tj <= b_i + b_j for c_i = -c_j
-        is_possible = np.ones(len(sigma), dtype=np.bool_)
-        for rows in find_opposite_rows(self._c):
-            is_possible &= needed[:, rows].sum(axis=1) <= self._b[rows].sum()
-        return int(np.logical_and.accumulate(is_possible).sum())
-
-    def _select_position_deviations(self) -> Array:
-        """Return the deviations (H,) for the allocation to the ages: those of the position with the largest one."""
-        sigma, index = self._deviations.compute(None), list(self.problem.plant.position_index)
-        rows = np.any(self._c[:, index] != 0.0, axis=1)
-        limited = sigma[:, rows] if rows.any() else sigma
-        return np.asarray(limited[:, limited[-1].argmax()] if limited.size else np.zeros(len(sigma)))
 
     def _allocate_rows(self, margin: Array, hard: Array, row_backoffs: _RowBackoffs) -> _PlanResult | None:
         """Plan all parts, and allocate the budgets to the rows of all of them in a few rounds.
