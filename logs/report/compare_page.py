@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -12,7 +13,6 @@ from matplotlib.axes import Axes
 from logs.recording.design_view import AXIS_NUMBER
 from logs.recording.flight import FlightData
 from logs.recording.output_files import refuse_recording_path, write_atomically
-from logs.report import page
 from logs.report.compare import FlightComparison, LoadedFlight
 from logs.report.compare_text import (
     convert_to_display_unit,
@@ -22,15 +22,13 @@ from logs.report.compare_text import (
     format_parameter,
     format_value,
 )
-from logs.report.page import Mark, PageSection
+from logs.report.page import Mark, Part, Section, render_facts, render_list, render_page, render_table
 from logs.report.plots import DASHED, DISPLAY_AXES, DOTTED, get_positions, position_limits, thin_path, thin_samples
 from logs.report.svg import Canvas, Drawing, colour, open_canvas
 from uavctl.arrays import Array
 from uavctl.errors import UsageError
 
 _ROLES = ("truth", "estimate", "sample", "plan", "target")
-_LIMIT = Mark("dashed", "limit", "limit of A")
-_HORIZON = Mark("dotted", "muted", "horizon H")
 _MAX_WIDTH_PT, _MIN_WIDTH_PT = (
     3.2,
     0.8,
@@ -50,37 +48,50 @@ def write_comparison_page(comparison: FlightComparison, recordings: Sequence[Loa
         raise UsageError(
             f"--out draws {len(_ROLES)} flights at most, these are {len(recordings)}; compare fewer at a time"
         )
-    write_atomically(path, render_comparison(comparison, recordings))
+    write_atomically(path, render_comparison(ComparisonView(comparison, recordings)))
 
 
-def render_comparison(comparison: FlightComparison, recordings: Sequence[LoadedFlight]) -> str:
+class ComparisonView(NamedTuple):
+    """What the page shows: the comparison, and the flights themselves."""
+
+    comparison: FlightComparison
+    recordings: Sequence[LoadedFlight]
+
+    @property
+    def flights(self) -> list[FlightData]:
+        """The flights, the first one first."""
+        return [recording.flight for recording in self.recordings]
+
+    @property
+    def names(self) -> list[str]:
+        """Their names."""
+        return [recording.identity.name for recording in self.recordings]
+
+    @property
+    def axes(self) -> list[str]:
+        """Axes that all flights have."""
+        return [axis for axis in self.flights[0].design.axes if all(axis in f.design.axes for f in self.flights)]
+
+
+def render_comparison(view: ComparisonView) -> str:
     """Return the page of a comparison as HTML."""
-    names = [recording.identity.name for recording in recordings]
-    sentences = [*map(describe_match, comparison.likenesses), *(f"Mind: {note}." for note in comparison.notes)]
-    title = f"Flights {', '.join(names)}"
-    return page.render_page(
-        title,
-        "The first is what the others are compared with.",
-        sentences,
-        _make_sections(comparison, recordings),
-        "How alike they are",
-    )
+    subtitle = f"The others are compared with {view.names[0]}."
+    return render_page(f"Comparison of {len(view.recordings)} flights", subtitle, SECTIONS, view)
 
 
-def _make_sections(comparison: FlightComparison, recordings: Sequence[LoadedFlight]) -> Iterator[PageSection]:
-    flights = [recording.flight for recording in recordings]
-    marks = tuple(Mark("line", _ROLES[index], recording.identity.name) for index, recording in enumerate(recordings))
-    axes = [axis for axis in flights[0].design.axes if all(axis in flight.design.axes for flight in flights)]
-    yield PageSection("Recordings", "", _make_recordings_table(comparison))
-    yield PageSection("Path", "", page.render_grid(list(_draw_paths(flights, axes))), (*marks, _LIMIT))
-    yield PageSection(
-        "Positions and age",
-        "Time counts from each flight's first tick. Positions are the true ones where they are known.",
-        page.render_grid([*(_draw_position(flights, axis) for axis in axes), _draw_ages(flights)]),
-        (*marks, _LIMIT, _HORIZON),
-    )
-    yield PageSection("Figures", "", _make_figure_tables(comparison))
-    yield PageSection("Parameters that differ", "", _make_parameter_table(comparison))
+def _describe_likeness(view: ComparisonView) -> Iterator[Part]:
+    matches = (describe_match(match, view.names[0]) for match in view.comparison.likenesses)
+    yield render_list([*matches, *(f"Mind: {note}." for note in view.comparison.notes)])
+
+
+def _draw_flights_over_time(view: ComparisonView) -> Iterator[Part]:
+    yield from (_draw_position(view.flights, axis) for axis in view.axes)
+    yield _draw_ages(view.flights)
+
+
+def _list_marks(view: ComparisonView) -> Iterator[Mark]:
+    yield from (Mark("line", role, name) for role, name in zip(_ROLES, view.names, strict=False))
+    yield Mark("dashed", "limit", f"limit of {view.names[0]}")
 
 
 def _draw_paths(flights: Sequence[FlightData], axes: Sequence[str]) -> Iterator[Drawing]:
@@ -162,41 +173,56 @@ def _get_limits(flight: FlightData, axis: str) -> list[float]:
     return [limit for limit in position_limits(flight.design, axis) if np.isfinite(limit)]
 
 
-def _make_recordings_table(comparison: FlightComparison) -> Markup:
-    return page.render_facts(
+def _show_recordings(view: ComparisonView) -> Iterator[Part]:
+    yield render_facts(
         (
             recording.name,
             f"{recording.recording} · {recording.started_utc} · {recording.command} · "
             f"{recording.ended}{'' if recording.finished else ', torn'}",
         )
-        for recording in comparison.recordings
+        for recording in view.comparison.recordings
     )
 
 
-def _make_figure_tables(comparison: FlightComparison) -> Markup:
-    indices = range(1, len(comparison.recordings))
-    parts = [indices[begin : begin + _MAX_COMPARED_COLUMNS] for begin in range(0, len(indices), _MAX_COMPARED_COLUMNS)]
-    return page.join(_make_figure_table(comparison, part) for part in parts)
+def _show_figures(view: ComparisonView) -> Iterator[Part]:
+    """Return the first flight's figures beside those of the others, a few others in each table."""
+    indices = range(1, len(view.recordings))
+    for begin in range(0, len(indices), _MAX_COMPARED_COLUMNS):
+        yield _make_figure_table(view, indices[begin : begin + _MAX_COMPARED_COLUMNS])
 
 
-def _make_figure_table(comparison: FlightComparison, indices: Sequence[int]) -> Markup:
-    """Return a table of the first flight's figures beside those of some others."""
-    names = {index: comparison.recordings[index].name for index in indices}
-    columns = ["figure", "A"]
-    columns += [text for name in names.values() for text in (name, f"{name} − A", f"{name} / A")]
+def _make_figure_table(view: ComparisonView, indices: Sequence[int]) -> Markup:
+    first = view.names[0]
+    columns = ["figure", first]
+    for index in indices:
+        name = view.names[index]
+        columns += [name, f"{name} − {first}", f"{name} / {first}"]
     rows = []
-    for figure in map(convert_to_display_unit, comparison.figures):
+    for figure in map(convert_to_display_unit, view.comparison.figures):
         cells = [format_value(figure.values[0])]
         for index in indices:
             cells += [format_value(figure.values[index]), format_difference(figure.differences[index - 1])]
             cells.append(format_value(figure.ratios[index - 1]))
         rows.append([format_label(figure), *(cell.replace("-", "−") for cell in cells)])
-    return page.render_table(columns, rows, frozenset(range(1, len(columns))))
+    return render_table(columns, rows, frozenset(range(1, len(columns))))
 
 
-def _make_parameter_table(comparison: FlightComparison) -> Markup:
-    if not comparison.parameters:
-        return page.render_paragraph("None.")
-    columns = ["parameter", *(recording.name for recording in comparison.recordings)]
-    rows = [[entry.key, *map(format_parameter, entry.values)] for entry in comparison.parameters]
-    return page.render_table(columns, rows, frozenset())
+def _show_parameters(view: ComparisonView) -> Iterator[Part]:
+    rows = [[entry.key, *map(format_parameter, entry.values)] for entry in view.comparison.parameters]
+    if rows:
+        yield render_table(["parameter", *view.names], rows, frozenset())
+
+
+SECTIONS: tuple[Section[ComparisonView], ...] = (
+    Section("How alike they are", _describe_likeness),
+    Section("Recordings", _show_recordings),
+    Section("Path", lambda view: _draw_paths(view.flights, view.axes), legend=_list_marks),
+    Section(
+        "Positions and age",
+        _draw_flights_over_time,
+        note="Time counts from each flight's first tick. Positions are the true ones where they are known.",
+        legend=lambda view: (*_list_marks(view), Mark("dotted", "muted", "horizon H")),
+    ),
+    Section("Figures", _show_figures),
+    Section("Parameters that differ", _show_parameters, otherwise="None."),
+)

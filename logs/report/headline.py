@@ -10,7 +10,7 @@ from pathlib import Path
 
 from logs.recording.flight import FLOWN, FlightData
 from logs.recording.reader import read
-from logs.recording.summary import FlightSummary, summarise
+from logs.recording.summary import summarise
 from logs.report.evidence import MIN_STALL_S, FlightEvidence
 from logs.report.findings import Finding, Headline, make_headline, metres, seconds, sort_findings
 from logs.report.reasons import describe_reasons
@@ -43,7 +43,7 @@ from logs.report.rules_positions import (
     find_wrong_positions,
 )
 from logs.report.rules_takeover import find_failsafe, find_takeover, find_vehicle_texts
-from logs.report.verdicts import Judgement, judge_flight
+from logs.report.verdicts import judge_flight
 from uavctl.cause import Cause
 from uavctl.errors import RecordingError
 from uavctl.records import ControlMode
@@ -51,9 +51,8 @@ from uavctl.records import ControlMode
 _START_S = 1.0  # it is still about where it began
 
 
-def derive_headline(flight: FlightData, summary: FlightSummary, judged: Judgement) -> Headline:
-    """Return what matters most in a flight; `summary` and `judged` are its figures and verdicts."""
-    evidence = FlightEvidence(flight, summary, judged)
+def derive_headline(evidence: FlightEvidence) -> Headline:
+    """Return what matters most in a flight."""
     findings = sort_findings(finding for rule in RULES for finding in rule(evidence))
     if not findings:
         return make_headline([_make_clear_finding(evidence)], reasons=describe_reasons(evidence, None))
@@ -70,7 +69,7 @@ def derive_headline_of_file(path: Path) -> Headline | None:
         flight = FlightData.from_records(read(path), path)
     except RecordingError:
         return None
-    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight))
+    return derive_headline(FlightEvidence(flight, summarise(flight, wall_s=None), judge_flight(flight)))
 
 
 _END_CAUSES = frozenset(

@@ -203,7 +203,7 @@ def test_without_truth_nothing_is_drawn_in_its_colour(flight: FlightData) -> Non
     def key(flight: FlightData) -> tuple[set[str], list[str]]:
         """Colours of the lines of the path in three dimensions, and what the small picture explains."""
         with collect_figures() as figures:
-            draw_path_3d(flight)
+            list(draw_path_3d(flight))
             draw_overview(flight)
         deep = {str(line.get_color()) for line in figures[""].axes[0].lines if line.get_marker() == "None"}
         return deep, [text.get_text() for text in figures["The path, from above"].legends[0].get_texts()]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -17,7 +17,7 @@ from logs.recording.flight import FlightData
 from logs.recording.notes import RecorderNote
 from logs.recording.summary import FlightSummary, list_summary_rows
 from logs.recording.topics import encode
-from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
+from logs.report.page import Mark, Part, Section, render_list, render_page, render_table
 from logs.report.plots import DASHED, DOTTED, draw_limits
 from logs.report.svg import Drawing, colour, open_canvas
 from sim.vehicle.linear import CACHED_TRANSITIONS
@@ -191,23 +191,6 @@ RECORDED_ROLE, WHAT_IF_ROLE = "truth", "plan"  # roles of the colours
 HEADINGS = ("", "recorded", "reproduced", "what-if")
 _COMPUTER_ROWS = ("Decision time", "Clock", "Tick lateness")  # depend on the computer
 _MIN_DROPPED_SHARE = 0.01  # of the inertial messages; a few are always older than the first attitude, or late
-_MARKS = (
-    Mark("line", RECORDED_ROLE, "recorded"),
-    Mark("line", WHAT_IF_ROLE, "what-if"),
-    Mark("dotted", "target", "target"),
-    Mark("dashed", "limit", "limit"),
-    Mark("band", "limit", "reserve kept"),
-)
-_VALIDITY_NOTE = (
-    "The recorded flight flown again with nothing changed tells whether this version decides as the one that flew. "
-    "How far the model goes wrong within a second is what the what-if column cannot know: the same happens to it, "
-    "counted as disturbance."
-)
-_MOTION_NOTE = (
-    "Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits and the "
-    "band along them, the largest reserve that the plan of the moment kept, are those of the what-if."
-)
-_AGE_NOTE = "Age of the newest position at each decision: a link that loses more, or later positions, is higher."
 
 
 def render_what_if_page(what_if: WhatIf, recorded: FlightData, other: FlightData) -> str:
@@ -216,7 +199,7 @@ def render_what_if_page(what_if: WhatIf, recorded: FlightData, other: FlightData
     Args:
         recorded: The recorded flight, cut to the compared part.
     """
-    return render_page("What if", what_if.flight, describe_what_if(what_if), _make_sections(what_if, recorded, other))
+    return render_page("What if", what_if.flight, _SECTIONS, _WhatIfView(what_if, recorded, other))
 
 
 def describe_what_if(what_if: WhatIf) -> list[str]:
@@ -259,15 +242,18 @@ def make_comparison_rows(what_if: WhatIf) -> Iterator[tuple[str, ...]]:
             yield (name, *(column.get(name, "-") for column in columns))
 
 
-def _make_sections(what_if: WhatIf, recorded: FlightData, other: FlightData) -> Iterator[PageSection]:
-    indices = recorded.design.position_index
-    axes = [_draw_axis(recorded, other, index, name) for index, name in zip(indices, recorded.design.axes, strict=True)]
-    yield PageSection("Motion", _MOTION_NOTE, render_grid(axes), _MARKS)
-    horizon = Mark("dashed", "limit", f"horizon H = {other.design.horizon}")
-    yield PageSection("Link", _AGE_NOTE, render_grid([_draw_ages(recorded, other)]), (*_MARKS[:2], horizon))
-    yield PageSection(
-        "Side by side", _VALIDITY_NOTE, render_table(HEADINGS, make_comparison_rows(what_if), frozenset())
-    )
+class _WhatIfView(NamedTuple):
+    """What the page shows: the result, and both flights cut to the compared part."""
+
+    result: WhatIf
+    recorded: FlightData
+    other: FlightData
+
+
+def _draw_motion(view: _WhatIfView) -> Iterator[Part]:
+    design = view.recorded.design
+    for index, name in zip(design.position_index, design.axes, strict=True):
+        yield _draw_axis(view.recorded, view.other, index, name)
 
 
 def _draw_axis(recorded: FlightData, other: FlightData, index: int, name: str) -> Drawing:
@@ -291,3 +277,41 @@ def _draw_ages(recorded: FlightData, other: FlightData) -> Drawing:
             ax.plot(steps.t_s, ages, color=colour(role), drawstyle="steps-post")
         ax.axhline(other.design.horizon, color=colour("limit"), lw=1.2, ls=DASHED)
     return Drawing("ages", canvas.svg, "age of the newest position at each decision of both flights, and the horizon")
+
+
+def _explain_ages(view: _WhatIfView) -> str:
+    return (
+        f"Age of the newest position at each decision; its plans last H = {view.other.design.horizon} steps. "
+        "A link that loses more, or later positions, is higher."
+    )
+
+
+_BOTH = (Mark("line", RECORDED_ROLE, "recorded"), Mark("line", WHAT_IF_ROLE, "what-if"))
+_SECTIONS: tuple[Section[_WhatIfView], ...] = (
+    Section("What happened", lambda view: [render_list(describe_what_if(view.result))]),
+    Section(
+        "Motion",
+        _draw_motion,
+        note="Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits "
+        "and the band along them, the largest reserve that the plan of the moment kept, are those of the what-if.",
+        legend=(
+            *_BOTH,
+            Mark("dotted", "target", "target"),
+            Mark("dashed", "limit", "limit"),
+            Mark("band", "limit", "reserve kept"),
+        ),
+    ),
+    Section(
+        "Link",
+        lambda view: [_draw_ages(view.recorded, view.other)],
+        note=_explain_ages,
+        legend=(*_BOTH, Mark("dashed", "limit", "horizon H")),
+    ),
+    Section(
+        "Side by side",
+        lambda view: [render_table(HEADINGS, make_comparison_rows(view.result), frozenset())],
+        note="The recorded flight flown again with nothing changed tells whether this version decides as the one that "
+        "flew. How far the model goes wrong within a second is what the what-if column cannot know: the same happens "
+        "to it, counted as disturbance.",
+    ),
+)
