@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -51,7 +51,8 @@ def write_comparison_page(comparison: FlightComparison, recordings: Sequence[Loa
     write_atomically(path, render_comparison(ComparisonView(comparison, recordings)))
 
 
-class ComparisonView(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ComparisonView:
     """What the page shows: the comparison, and the flights themselves."""
 
     comparison: FlightComparison

@@ -23,7 +23,7 @@ from logs.report.svg import FONT, Drawing, make_css_variables
 NOTHING = Markup("")
 _MIN_CONTENTS_SECTIONS = 9  # sections from which on a page has a list of them
 
-View = TypeVar("View")
+View = TypeVar("View", contravariant=True)
 Part = Markup | str | Drawing  # HTML, a sentence, or a figure
 MarkKind = Literal[
     "line", "thin", "dashed", "dotted", "planned", "dot", "ring", "star", "cross", "tick", "band", "marker"

@@ -34,6 +34,7 @@ from uavctl.config.load import parse_recorded, parse_toml
 from uavctl.errors import UsageError
 from uavctl.lab.tune.change import check_tunable
 from uavctl.lab.tune.excitation import DOWN, SafeBox, add_excitation, check_start, parse_box
+from uavctl.lab.tune.figures import TuneFigures, list_figure_rows
 from uavctl.wiring.controller import build_flight_design
 
 _HORIZONTAL = (0, 1)
@@ -161,17 +162,8 @@ def _render(result: TuneResult) -> Iterator[RenderableType]:
         headings = ("value", "old", "new", "why")
         yield make_table("Configuration", headings, rows, headings, fold=True)
     if result.figures is not None and result.prediction_m is not None:
-        first, second = result.figures
-        old_m, new_m = result.prediction_m
-        lines = (
-            ("distance from the last waypoint, rms [cm]", first.hold_rms_m, second.hold_rms_m),
-            ("outside the box, at most [cm]", first.beyond_box_m, second.beyond_box_m),
-            ("prediction of the second flight, error [cm]", old_m, new_m),
-        )
-        cells = [
-            (text, *("–" if value is None else f"{100 * value:.1f}" for value in values)) for text, *values in lines
-        ]
-        yield make_table("Before and after", ("", "before", "after"), cells)
+        figure_rows = list_figure_rows(TuneFigures(*result.figures, *result.prediction_m))
+        yield make_table("Before and after", ("", "before", "after"), figure_rows)
     if result.config is not None:
         yield Text(f"configuration: {result.config}")
     if result.report is not None:
