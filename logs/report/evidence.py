@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from logs.recording.design_view import AXIS_NUMBER
-from logs.recording.flight import FLOWN, FlightData
+from logs.recording.flight import FLOWN, FlightData, find_spans
 from logs.recording.summary import BLIND_S, FlightSummary
 from logs.report.excursion import Clearance, Excursion, find_excursions
 from logs.report.verdicts import Judgement, read_flown_config
@@ -61,16 +61,7 @@ class FlightEvidence:
     @cached_property
     def armed_spans(self) -> list[tuple[float, float]]:
         """From when to when the vehicle was armed, by its heartbeats [s]."""
-        spans: list[tuple[float, float]] = []
-        since: float | None = None
-        for status in self.flight.vehicles:
-            at_s = self.to_seconds(status.at_ns)
-            if status.armed and since is None:
-                since = at_s
-            elif not status.armed and since is not None:
-                spans.append((since, at_s))
-                since = None
-        return spans if since is None else [*spans, (since, np.inf)]
+        return find_spans(((self.to_seconds(status.at_ns), status.armed) for status in self.flight.vehicles), np.inf)
 
     def is_armed(self, at_s: float) -> bool:
         """Return whether the vehicle was armed at a time, to a heartbeat's period."""

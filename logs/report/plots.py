@@ -8,17 +8,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from logs.recording.design_view import AXIS_NUMBER, DesignView
 from logs.recording.flight import FlightData
-from logs.recording.summary import (
-    RELATIVE_TOLERANCE,
-    WIRE_TOLERANCE,
-    compute_box,
-    compute_limits,
-    compute_position_errors_m,
-)
+from logs.recording.summary import compute_box, compute_position_errors_m, find_state_violations
 from logs.report.excursion import Excursion, find_excursions, select_trusted_estimates
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from uavctl.arrays import Array
@@ -270,27 +263,6 @@ def _draw_state(flight: FlightData, axis: str, index: int, y_label: str, title: 
         ax.plot(steps.t_s[outside], sign * steps.state[outside, index], "x", ms=6, mew=1.6, color=colour("limit"))
         set_time_axis(ax, flight)
     return Drawing(key, canvas.svg, f"{title} over time against its limits")
-
-
-def find_state_violations(flight: FlightData, index: int) -> NDArray[np.bool_]:
-    """Return at which flown boundaries a limit that a state has a part in is violated (n,)."""
-    states, limits = flight.steps.state, compute_limits(flight, flight.steps.t_s)
-    rows = np.flatnonzero([normal[index] != 0.0 for normal in flight.design.c_x])
-    return _find_violations(states, np.array(flight.design.c_x)[rows], limits[:, rows], RELATIVE_TOLERANCE)
-
-
-def find_input_violations(flight: FlightData, number: int) -> NDArray[np.bool_]:
-    """Return at which flown boundaries a limit that an input has a part in is violated, as decided or applied (n,)."""
-    design, steps = flight.design, flight.steps
-    rows = np.flatnonzero([normal[number] != 0.0 for normal in design.c_u])
-    c, b = np.array(design.c_u)[rows], np.array(design.b_u)[rows]
-    outside = ~np.isnan(steps.decided).any(axis=1) & _find_violations(steps.decided, c, b, RELATIVE_TOLERANCE)
-    return outside | _find_violations(steps.input, c, b, WIRE_TOLERANCE) if steps.from_truth else outside
-
-
-def _find_violations(values: Array, c: Array, b: Array, tolerance: float) -> NDArray[np.bool_]:
-    normals = c.reshape(-1, values.shape[1])
-    return np.asarray(~(values @ normals.T <= b + tolerance * np.maximum(1.0, np.abs(b))).all(axis=1))
 
 
 def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:

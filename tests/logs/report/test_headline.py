@@ -16,14 +16,14 @@ from synthetic_flight import fly
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import summarise
+from logs.recording.summary import find_input_violations, find_state_violations, summarise
 from logs.report.cursor import render_cursor_script
 from logs.report.evidence import FlightEvidence
 from logs.report.excursion import find_excursions
 from logs.report.findings import Headline
 from logs.report.headline import derive_headline
 from logs.report.path_3d import draw_path_3d
-from logs.report.plots import draw_path_views, find_input_violations, find_moving_limits, find_state_violations
+from logs.report.plots import draw_path_views, find_moving_limits
 from logs.report.verdicts import Judgement, judge_flight
 from uavctl.cause import BAD, CAUTION, GOOD, Cause
 from uavctl.records import Setpoint, SetpointSource, Truth

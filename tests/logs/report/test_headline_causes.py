@@ -339,7 +339,7 @@ def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData
     headline = head(add_event(failed, 1.0, "vehicle-text", "Max Alt fence breached", Severity.INFO))
     assert headline.causes[:3] == (Cause.BATTERY_EMPTY, Cause.VEHICLE_FENCE, Cause.VEHICLE_FAILSAFE)
     assert sort_findings([]) == []
-    assert classify_text("PreArm: Battery Failsafe", is_error=True, is_warning=True) is None
+    assert classify_text("PreArm: Battery Failsafe", Severity.ERROR) is None
 
 
 @pytest.mark.parametrize(("lets_go", "reason"), [(False, "held back"), (True, "held back"), (True, "nothing comes")])
