@@ -34,6 +34,8 @@ VIEWS: dict[str, tuple[tuple[str, ...], Array]] = {
     "side": (("east", "down"), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])),
     "deep": ((), np.array([[0.42, 1.0, 0.0], [0.36, -0.12, -1.0]])),
 }
+# Key, title, and the axes across and up.
+PATH_VIEWS = (("path-above", "From above", ("east", "north")), ("path-side", "From the south", ("east", "down")))
 RATE_NAMES = {"north": "speed north", "east": "speed east", "down": "climb rate"}
 
 # Text beside a mark that is to be seen: of the limits' colour, on a ground that keeps it readable.
@@ -74,9 +76,9 @@ def find_moving_limits(flight: FlightData) -> list[MovingLimit]:
 
 def draw_path_views(flight: FlightData) -> Iterator[Drawing]:
     """Draw the path from above, and from the side if the plant moves vertically."""
-    yield draw_path_view(flight, "path-above", "From above", ("east", "north"))
-    if "down" in flight.design.axes:
-        yield draw_path_view(flight, "path-side", "From the south", ("east", "down"))
+    for key, title, axes_shown in PATH_VIEWS:
+        if "down" not in axes_shown or "down" in flight.design.axes:
+            yield draw_path_view(flight, key, title, axes_shown)
 
 
 def draw_path_view(flight: FlightData, key: str, title: str, axes_shown: tuple[str, str]) -> Drawing:
@@ -258,14 +260,14 @@ def _draw_state(flight: FlightData, axis: str, index: int, y_label: str, title: 
             flight.seconds([t.at_ns for t in flight.truths]), np.array([sign * t.state[index] for t in flight.truths])
         )
         ax.plot(truth_s, truth, color=colour("truth"), lw=1.0)
-        _draw_target(ax, flight, index, sign)
+        draw_target(ax, flight, index, sign)
         steps = flight.steps
         ax.plot(steps.t_s[outside], sign * steps.state[outside, index], "x", ms=6, mew=1.6, color=colour("limit"))
         set_time_axis(ax, flight)
     return Drawing(key, canvas.svg, f"{title} over time against its limits")
 
 
-def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
+def draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
     """Draw the target of a state over time: steps between waypoints, or a trajectory."""
     t_s, states = flight.targets
     ends_s = np.append(t_s, flight.duration_s)

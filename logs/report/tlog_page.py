@@ -12,7 +12,7 @@ from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo
 from logs.recording.output_files import write_atomically
 from logs.report.figures import thin_keeping_largest
 from logs.report.page import Mark, Part, Section, render_facts, render_folded, render_list, render_page, render_table
-from logs.report.plots import DISPLAY_AXES, DOTTED, RATE_NAMES, has_variation, thin_path, thin_samples
+from logs.report.plots import DISPLAY_AXES, DOTTED, PATH_VIEWS, RATE_NAMES, has_variation, thin_path, thin_samples
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from logs.report.tlog_headline import derive_tlog_headline
 from uavctl.arrays import Array
@@ -97,10 +97,7 @@ def _make_table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Iter
 
 
 def _draw_paths(flight: MavlinkFlight) -> Iterator[Drawing]:
-    for key, title, axes_shown in (
-        ("path-above", "From above", ("east", "north")),
-        ("path-side", "From the south", ("east", "down")),
-    ):
+    for key, title, axes_shown in PATH_VIEWS:
         columns = [AXIS_NUMBER[axis] for axis in axes_shown]
         tracks = (flight.own.position_m, *(track.position_m for track in flight.sent.values()))
         if not any(has_variation(track[:, number]) for track in tracks for number in columns):

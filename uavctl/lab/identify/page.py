@@ -10,8 +10,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from logs.report.page import Part, Section, render_folded, render_list, render_page, render_table
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
+from logs.report.verdict_figures import draw_correlation
 from uavctl.config.load import dump_config
-from uavctl.lab.identify.fit import LAGS, R2_AHEAD_S, Prediction
+from uavctl.lab.identify.fit import R2_AHEAD_S, Prediction
 from uavctl.lab.identify.history import PositionHistory
 from uavctl.lab.identify.result import Identification, Identified, describe_loss
 
@@ -123,7 +124,11 @@ def _show_dead_time(view: _IdentifyView) -> Iterator[Part]:
 def _draw_residuals(view: _IdentifyView) -> Iterator[Part]:
     for name, prediction in view.axes:
         yield _draw_innovations(name, prediction)
-        yield _draw_correlation(name, prediction)
+        bound = 1.96 / np.sqrt(max(len(prediction.innovations_m), 1))  # 95 % of the correlations of white noise
+        outside = int(np.count_nonzero(np.abs(prediction.correlation) > bound))
+        total = len(prediction.correlation)
+        label = f"{name}: {outside} of {total} correlations are outside the 95 % band of white noise"
+        yield draw_correlation(name, prediction.correlation, bound, label)
 
 
 def _draw_link(view: _IdentifyView) -> Iterator[Part]:
@@ -169,21 +174,6 @@ def _draw_innovations(name: str, prediction: Prediction) -> Drawing:
     inside = float(np.mean(np.abs(prediction.innovations_m) <= 2.0 * prediction.stds_m))
     label = f"{name}: innovations with two standard deviations; {100 * inside:.0f} % are inside, 95 % should be"
     return Drawing(f"innovations-{name}", canvas.svg, label)
-
-
-def _draw_correlation(name: str, prediction: Prediction) -> Drawing:
-    lags = np.arange(1, len(prediction.correlation) + 1)
-    band = 1.96 / np.sqrt(max(len(prediction.innovations_m), 1))
-    with open_canvas(f"white-{name}", _HEIGHT_IN) as canvas:
-        ax = canvas.axes(f"{name}: correlation of innovations", "positions apart", "correlation")
-        ax.bar(lags, prediction.correlation, color=colour("estimate"), width=0.6)
-        for sign in (-band, band):
-            ax.axhline(sign, color=colour("limit"), linewidth=0.8)
-        ax.set_xlim(0, LAGS + 1)
-        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    outside = int(np.count_nonzero(np.abs(prediction.correlation) > band))
-    label = f"{name}: {outside} of {len(lags)} correlations are outside the 95 % band of white noise"
-    return Drawing(f"white-{name}", canvas.svg, label)
 
 
 def _draw_delays(positions: PositionHistory) -> Drawing:
@@ -245,7 +235,7 @@ _SECTIONS: tuple[Section[_IdentifyView], ...] = (
         "What is left unexplained",
         _draw_residuals,
         note="Each position minus its prediction from those before: with a right model, 95 % are between the lines, "
-        "and one does not tell the next (bars between the lines).",
+        "and one does not tell the next (correlations within the band).",
     ),
     Section(
         "Link",

@@ -17,9 +17,8 @@ from logs.recording.flight import FlightData
 from logs.recording.notes import RecorderNote
 from logs.recording.summary import FlightSummary, list_summary_rows
 from logs.recording.topics import encode
-from logs.report.page import Mark, Part, Section, render_list, render_page, render_table
-from logs.report.plots import DASHED, DOTTED, draw_limits
-from logs.report.svg import Drawing, colour, open_canvas
+from logs.report import overlays
+from logs.report.page import Mark, Section, render_list, render_page, render_table
 from sim.vehicle.linear import CACHED_TRANSITIONS
 from uavctl.arrays import Array
 from uavctl.lab.whatif.flight import Entry, RecordedFlight, VehicleResponse
@@ -186,8 +185,6 @@ def _compute_max_difference(both: Iterable[dict[int, tuple[float, ...]]]) -> flo
     return max(map(float, differences), default=0.0)
 
 
-_HEIGHT_IN = 2.6
-RECORDED_ROLE, WHAT_IF_ROLE = "truth", "plan"  # roles of the colours
 HEADINGS = ("", "recorded", "reproduced", "what-if")
 _COMPUTER_ROWS = ("Decision time", "Clock", "Tick lateness")  # depend on the computer
 _MIN_DROPPED_SHARE = 0.01  # of the inertial messages; a few are always older than the first attitude, or late
@@ -249,34 +246,10 @@ class _WhatIfView(NamedTuple):
     recorded: FlightData
     other: FlightData
 
-
-def _draw_motion(view: _WhatIfView) -> Iterator[Part]:
-    design = view.recorded.design
-    for index, name in zip(design.position_index, design.axes, strict=True):
-        yield _draw_axis(view.recorded, view.other, index, name)
-
-
-def _draw_axis(recorded: FlightData, other: FlightData, index: int, name: str) -> Drawing:
-    with open_canvas(f"motion-{name}", _HEIGHT_IN) as canvas:
-        ax = canvas.axes(name, "time [s]", "position [m]")
-        draw_limits(ax, other, index, 1.0)
-        for flight, role in ((recorded, RECORDED_ROLE), (other, WHAT_IF_ROLE)):
-            steps = flight.steps
-            ax.plot(steps.t_s, steps.state[:, index], color=colour(role))
-        ax.plot(other.steps.t_s, other.steps.target[:, index], color=colour("target"), ls=DOTTED, lw=1.1)
-    label = f"position {name} of the recorded flight and of the other over time, against the limits of the other"
-    return Drawing(f"motion-{name}", canvas.svg, label)
-
-
-def _draw_ages(recorded: FlightData, other: FlightData) -> Drawing:
-    with open_canvas("ages", _HEIGHT_IN) as canvas:
-        ax = canvas.axes("Age of the newest position", "time [s]", "steps")
-        for flight, role in ((recorded, RECORDED_ROLE), (other, WHAT_IF_ROLE)):
-            steps = flight.steps
-            ages = np.array([np.nan if d.age_steps is None else d.age_steps for d in steps.decisions])
-            ax.plot(steps.t_s, ages, color=colour(role), drawstyle="steps-post")
-        ax.axhline(other.design.horizon, color=colour("limit"), lw=1.2, ls=DASHED)
-    return Drawing("ages", canvas.svg, "age of the newest position at each decision of both flights, and the horizon")
+    @property
+    def flights(self) -> tuple[FlightData, FlightData]:
+        """Both flights."""
+        return self.recorded, self.other
 
 
 def _explain_ages(view: _WhatIfView) -> str:
@@ -286,12 +259,17 @@ def _explain_ages(view: _WhatIfView) -> str:
     )
 
 
-_BOTH = (Mark("line", RECORDED_ROLE, "recorded"), Mark("line", WHAT_IF_ROLE, "what-if"))
+_BOTH = tuple(Mark("line", role, name) for role, name in zip(overlays.ROLES, ("recorded", "what-if"), strict=False))
 _SECTIONS: tuple[Section[_WhatIfView], ...] = (
     Section("What happened", lambda view: [render_list(describe_what_if(view.result))]),
     Section(
+        "Path",
+        lambda view: overlays.draw_paths(view.flights),
+        legend=(*_BOTH, Mark("dashed", "limit", "limit of the recorded flight")),
+    ),
+    Section(
         "Motion",
-        _draw_motion,
+        lambda view: overlays.draw_positions(view.flights, view.other),
         note="Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits "
         "and the band along them, the largest reserve that the plan of the moment kept, are those of the what-if.",
         legend=(
@@ -303,9 +281,9 @@ _SECTIONS: tuple[Section[_WhatIfView], ...] = (
     ),
     Section(
         "Link",
-        lambda view: [_draw_ages(view.recorded, view.other)],
+        lambda view: [overlays.draw_ages(view.flights)],
         note=_explain_ages,
-        legend=(*_BOTH, Mark("dashed", "limit", "horizon H")),
+        legend=(*_BOTH, Mark("dotted", "muted", "horizon H")),
     ),
     Section(
         "Side by side",
