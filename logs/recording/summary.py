@@ -17,7 +17,7 @@ from rich.text import Text
 from logs.recording.design_view import Box
 from logs.recording.flight import FLOWN, FlightData
 from uavctl.account import make_ending, report_lost_records
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.cause import CAUSES, Cause
 from uavctl.config.load import parse_stored_toml
 from uavctl.config.mission import FenceConfig
@@ -323,7 +323,7 @@ def compute_course_error(flight: FlightData) -> CourseError | None:
     return compute_errors_from_arrival(flight.steps.t_s, compute_position_errors_m(flight), moved)
 
 
-def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: NDArray[np.bool_]) -> CourseError | None:
+def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: Flags) -> CourseError | None:
     """Return what distances come to that count from each arrival on; None without one.
 
     Args:
@@ -340,7 +340,7 @@ def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: NDArray[n
     return CourseError(float(np.sqrt(np.mean(counted_m**2))), float(counted_m.max()), float(at_s[counted_m.argmax()]))
 
 
-def find_state_violations(flight: FlightData, state: int | None = None) -> NDArray[np.bool_]:
+def find_state_violations(flight: FlightData, state: int | None = None) -> Flags:
     """Return at which flown boundaries the state violates its set or a fence (n,); NaN counts as outside.
 
     Where the truth is unknown, a state without a position that plans still reach from is a mere prediction, and no step
@@ -359,7 +359,7 @@ def find_state_violations(flight: FlightData, state: int | None = None) -> NDArr
     return is_outside
 
 
-def find_input_violations(flight: FlightData, number: int | None = None) -> NDArray[np.bool_]:
+def find_input_violations(flight: FlightData, number: int | None = None) -> Flags:
     """Return at which flown boundaries the input, as decided or as applied, violates its set (n,).
 
     Args:
@@ -501,7 +501,7 @@ def _count_fallbacks(flight: FlightData) -> int:
     return sum(b and not a for a, b in pairwise([False, *is_fallback]))
 
 
-def _find_violations(values: Array, normals: Array, limits: Array, tolerance: float) -> NDArray[np.bool_]:
+def _find_violations(values: Array, normals: Array, limits: Array, tolerance: float) -> Flags:
     """Return which rows of `values` (n, m) violate {v | normals v <= limits} by more than a relative tolerance."""
     bounds = limits + tolerance * np.maximum(1.0, np.abs(limits))
     return np.asarray(~(values @ normals.T <= bounds).all(axis=1))

@@ -20,8 +20,7 @@ from logs.report.evidence import HEARTBEAT_S, FlightEvidence
 from logs.report.findings import Finding, metres, seconds
 from logs.report.rules_loss import NEGLIGIBLE_SHARE, find_battery_fault
 from logs.report.rules_takeover import find_external_exit
-from logs.report.verdict_risk import Flags
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.cause import BAD, CAUTION, Cause
 from uavctl.event_codes import EventCode
 from uavctl.records import ControlMode, Severity

@@ -5,7 +5,6 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from logs.report.innovations import InnovationSamples
 from logs.report.verdict_model import (
@@ -16,8 +15,8 @@ from logs.report.verdict_model import (
     compute_power_bounds,
     judge_innovations,
 )
+from uavctl.arrays import Array
 
-Array = NDArray[np.float64]
 AXES = ("north", "east", "down")
 
 

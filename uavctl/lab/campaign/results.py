@@ -24,7 +24,7 @@ from logs.report.run_statistics import (
     step_rate,
 )
 from logs.report.statistics import replace_infinite
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.errors import RecordingError, UavctlError
 
 DOCUMENT, RUNS = "campaign.json", "runs.parquet"
@@ -247,13 +247,13 @@ def _collect_runs(rows: pa.Table, cell: CellFigures) -> CampaignRuns:  # noqa: A
     )
 
 
-def _read_column(rows: pa.Table, name: str, is_complete: NDArray[np.bool_]) -> Values:
+def _read_column(rows: pa.Table, name: str, is_complete: Flags) -> Values:
     if name in _LATER_COLUMNS and name not in rows.column_names:
         return np.full(int(is_complete.sum()), np.nan)
     return np.asarray(rows[name].to_numpy()[is_complete], dtype=np.float64)
 
 
-def _sum_histograms(lists: pa.ChunkedArray, is_complete: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _sum_histograms(lists: pa.ChunkedArray, is_complete: Flags) -> NDArray[np.int64]:
     """Return the sum of histograms of any lengths."""
     column = lists.combine_chunks().filter(pa.array(is_complete))
     counts = column.flatten().to_numpy()

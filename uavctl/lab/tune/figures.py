@@ -8,10 +8,10 @@ from enum import StrEnum
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import compute_position_errors_m
+from uavctl.arrays import Flags
 from uavctl.config import Config
 from uavctl.lab.identify.history import FlightHistory
 from uavctl.lab.identify.result import compute_ramp_delay_s, make_fitted_stretches
@@ -88,7 +88,7 @@ def compute_flight_figures(flight: FlightData, box: SafeBox | None) -> TunedFlig
     )
 
 
-def find_last_waypoint_steps(flight: FlightData) -> tuple[NDArray[np.bool_], float]:
+def find_last_waypoint_steps(flight: FlightData) -> tuple[Flags, float]:
     """Return which steps (n,) flew plans to the last waypoint, and since when that was the target [s]."""
     steps = flight.steps
     is_tracked = np.array([d.mode is ControlMode.TRACK for d in steps.decisions], dtype=np.bool_)
@@ -103,7 +103,7 @@ def find_last_waypoint_steps(flight: FlightData) -> tuple[NDArray[np.bool_], flo
     return is_chosen, float(steps.t_s[begin])
 
 
-def find_hold_steps(flight: FlightData) -> NDArray[np.bool_]:
+def find_hold_steps(flight: FlightData) -> Flags:
     """Return the steps (n,) that held the last waypoint: from `SETTLING_S` after it became the target."""
     is_chosen, since_s = find_last_waypoint_steps(flight)
     return np.asarray(is_chosen & (flight.steps.t_s >= since_s + SETTLING_S), dtype=np.bool_)
