@@ -1,4 +1,4 @@
-"""Evidence of a flight: what its records show of positions, pushes, battery and silence, for the headline's rules."""
+"""Account of a recorded flight: what its records, figures and verdicts show. Headline and page are made from it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import numpy as np
 from logs.recording.design_view import AXIS_NUMBER
 from logs.recording.flight import FLOWN, FlightData, find_spans
 from logs.recording.summary import BLIND_S, FlightSummary
+from logs.report.battery import find_battery_faults
 from logs.report.excursion import Clearance, Excursion, find_excursions
+from logs.report.findings import Finding
 from logs.report.verdicts import Judgement, read_flown_config
 from uavctl.arrays import Array
 from uavctl.config import Config
@@ -38,7 +40,7 @@ class Push(NamedTuple):
 
 
 class FlightEvidence:
-    """What the records of a flight show."""
+    """What the records of a flight show, with its figures and verdicts."""
 
     def __init__(self, flight: FlightData, summary: FlightSummary, judged: Judgement) -> None:
         self.flight, self.summary, self.judged = flight, summary, judged
@@ -81,6 +83,11 @@ class FlightEvidence:
             if status.battery_v is not None and status.armed
         ]
         return np.array([at_s for at_s, _ in readings]), np.array([volts for _, volts in readings], dtype=np.float64)
+
+    @cached_property
+    def battery_faults(self) -> tuple[Finding, ...]:
+        """Findings on a battery that gave in while armed."""
+        return tuple(find_battery_faults(*self.battery_v))
 
     @cached_property
     def captured_s(self) -> Array:

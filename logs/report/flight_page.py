@@ -113,7 +113,7 @@ def _draw_plans(e: FlightEvidence) -> Iterator[Part]:
 def _explain_certificates(e: FlightEvidence) -> str:
     slack_text = (
         "Slack is what state limits gave way by (light); the rest at the end of a plan may be missed, too (dark)."
-        if plan_figures.find_relaxed_plans(e.flight)
+        if plan_figures.select_relaxed_plans(e.flight)
         else "Slack is what state limits give way by, so that there is a plan at all. No plan that was flown gave way "
         "anywhere."
     )

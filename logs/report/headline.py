@@ -5,7 +5,8 @@ Each rule looks at one kind of cause and yields its findings. `logs.report.cause
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
+from operator import attrgetter
 from pathlib import Path
 
 from logs.recording.flight import FLOWN, FlightData
@@ -17,7 +18,6 @@ from logs.report.reasons import describe_reasons
 from logs.report.rules_loss import (
     describe_depth,
     describe_source,
-    find_battery_fault,
     find_blind_flight,
     find_excursion,
     find_process_pause,
@@ -141,8 +141,8 @@ def _describe_clearance(e: FlightEvidence) -> str:
     return f"inside its walls {period}, {nearest_text}{describe_source(e, at_s)}"
 
 
-RULES: tuple[Callable[[FlightEvidence], Iterator[Finding]], ...] = (
-    find_battery_fault,
+RULES: tuple[Callable[[FlightEvidence], Iterable[Finding]], ...] = (
+    attrgetter("battery_faults"),
     find_excursion,
     find_vehicle_loss,
     find_recording_cut,
