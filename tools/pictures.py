@@ -59,10 +59,8 @@ def terminal(*command: str) -> str:
 def pictures(flight: FlightData) -> Iterator[tuple[str, Drawing]]:
     """Name and drawing of each picture."""
     judged = judge_flight(flight)
-    yield "timeline", draw_timeline(flight)[0]
-    deep = draw_path_3d(flight)
-    if deep is not None:
-        yield "path", deep
+    yield "timeline", next(draw_timeline(flight))
+    yield from (("path", drawing) for drawing in draw_path_3d(flight))
     yield "axis", next(plots.draw_axes_over_time(flight))
     yield "age", figures.draw_age_figure(flight)
     yield "link", next(link_figures.draw_link_ages(flight, judged.verdicts.link))

@@ -47,6 +47,24 @@ MIN_TARGET_CHANGES = 3  # successive boundaries with another target each: it mov
 FALLBACK = frozenset({ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND})
 
 
+def find_spans(states: Iterable[tuple[float, bool]], end_s: float) -> list[tuple[float, float]]:
+    """Return the spans of time [s] in which a state held.
+
+    Args:
+        states: Times [s] in their order, and whether the state held from then on.
+        end_s: End of a span that the last of them leaves open.
+    """
+    spans: list[tuple[float, float]] = []
+    begun_s: float | None = None
+    for at_s, holds in states:
+        if holds and begun_s is None:
+            begun_s = at_s
+        elif not holds and begun_s is not None:
+            spans.append((begun_s, at_s))
+            begun_s = None
+    return spans if begun_s is None else [*spans, (begun_s, end_s)]
+
+
 class Landing(NamedTuple):
     """Begin of a wanted landing [ns], and whether the operator ordered it or the mission ended with it."""
 
@@ -249,18 +267,8 @@ class FlightData:
 
     def spans(self, modes: Collection[ControlMode]) -> list[tuple[float, float]]:
         """Return the spans of flown time [s] in which the mode was one of `modes`; none after the operator's stop."""
-        spans: list[tuple[float, float]] = []
-        begun: int | None = None
-        for decision in self.flown:
-            if decision.mode in modes and begun is None:
-                begun = decision.at_ns
-            elif decision.mode not in modes and begun is not None:
-                spans.append((self._second(begun), self._second(decision.at_ns)))
-                begun = None
-        if begun is not None:
-            end_s = self.duration_s if self.stopped_ns is None else self._second(self.stopped_ns)
-            spans.append((self._second(begun), end_s))
-        return spans
+        end_s = self.duration_s if self.stopped_ns is None else self._second(self.stopped_ns)
+        return find_spans(((self._second(d.at_ns), d.mode in modes) for d in self.flown), end_s)
 
     def lost_at_s(self) -> Array:
         """Return when the simulated channel lost positions (n,) [s], one entry each; empty for a real flight."""

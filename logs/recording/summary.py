@@ -17,13 +17,13 @@ from rich.text import Text
 from logs.recording.design_view import Box
 from logs.recording.flight import FLOWN, FlightData
 from uavctl.account import make_ending, report_lost_records
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.cause import CAUSES, Cause
 from uavctl.config.load import parse_stored_toml
 from uavctl.config.mission import FenceConfig
 from uavctl.errors import ConfigError
 from uavctl.number_text import format_duration, format_number, format_percent_above
-from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector
+from uavctl.records import ControlMode, Ending, SolveStatus
 
 _LANDED = frozenset({Cause.FALLBACK_LANDED, Cause.LANDED_AS_ORDERED, Cause.LANDED_AFTER_MISSION})
 _IN_FLIGHT = {
@@ -323,7 +323,7 @@ def compute_course_error(flight: FlightData) -> CourseError | None:
     return compute_errors_from_arrival(flight.steps.t_s, compute_position_errors_m(flight), moved)
 
 
-def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: NDArray[np.bool_]) -> CourseError | None:
+def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: Flags) -> CourseError | None:
     """Return what distances come to that count from each arrival on; None without one.
 
     Args:
@@ -340,28 +340,44 @@ def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: NDArray[n
     return CourseError(float(np.sqrt(np.mean(counted_m**2))), float(counted_m.max()), float(at_s[counted_m.argmax()]))
 
 
-def find_state_violations(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def find_state_violations(flight: FlightData, state: int | None = None) -> Flags:
     """Return at which flown boundaries the state violates its set or a fence (n,); NaN counts as outside.
 
     Where the truth is unknown, a state without a position that plans still reach from is a mere prediction, and no step
     counts as outside by it.
+
+    Args:
+        state: Index of a state: count the limits alone that it has a part in.
     """
-    steps = flight.steps
-    is_outside = _find_violations(steps.state, flight.design.c_x, compute_limits(flight, steps.t_s), RELATIVE_TOLERANCE)
+    steps, normals = flight.steps, np.array(flight.design.c_x).reshape(-1, len(flight.design.q_x))
+    rows = _find_rows(normals, state)
+    limits = compute_limits(flight, steps.t_s)[:, rows]
+    is_outside = _find_violations(steps.state, normals[rows], limits, RELATIVE_TOLERANCE)
     if not steps.from_truth:
         ages = np.array([0 if decision.age_steps is None else decision.age_steps for decision in steps.decisions])
         is_outside &= ages <= flight.design.horizon
     return is_outside
 
 
-def find_input_violations(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return at which flown boundaries the input, as decided or as applied, violates its set (n,)."""
-    design, steps = flight.design, flight.steps
+def find_input_violations(flight: FlightData, number: int | None = None) -> Flags:
+    """Return at which flown boundaries the input, as decided or as applied, violates its set (n,).
+
+    Args:
+        number: Number of an input: count the limits alone that it has a part in.
+    """
+    steps, normals = flight.steps, np.array(flight.design.c_u).reshape(-1, len(flight.design.q_u))
+    rows = _find_rows(normals, number)
+    normals, bounds = normals[rows], np.array(flight.design.b_u)[rows]
     has_input = ~np.isnan(steps.decided).any(axis=1)
-    is_outside = has_input & _find_violations(steps.decided, design.c_u, design.b_u, RELATIVE_TOLERANCE)
+    is_outside = has_input & _find_violations(steps.decided, normals, bounds, RELATIVE_TOLERANCE)
     if steps.from_truth:
-        is_outside |= _find_violations(steps.input, design.c_u, design.b_u, WIRE_TOLERANCE)
+        is_outside |= _find_violations(steps.input, normals, bounds, WIRE_TOLERANCE)
     return is_outside
+
+
+def _find_rows(normals: Array, component: int | None) -> NDArray[np.int64]:
+    """Return the rows of a set {v | normals v <= b} that a component of v has a part in; all rows for None."""
+    return np.arange(len(normals)) if component is None else np.flatnonzero(normals[:, component])
 
 
 def get_decision_times_us(flight: FlightData) -> Array:
@@ -485,13 +501,10 @@ def _count_fallbacks(flight: FlightData) -> int:
     return sum(b and not a for a, b in pairwise([False, *is_fallback]))
 
 
-def _find_violations(
-    values: Array, c: Matrix, b: Vector | Array, tolerance: float
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which rows of `values` (n, m) violate {v | c v <= b} by more than a relative tolerance."""
-    normals = np.array(c).reshape(-1, values.shape[1])
-    limit = np.array(b)
-    return np.asarray(~(values @ normals.T <= limit + tolerance * np.maximum(1.0, np.abs(limit))).all(axis=1))
+def _find_violations(values: Array, normals: Array, limits: Array, tolerance: float) -> Flags:
+    """Return which rows of `values` (n, m) violate {v | normals v <= limits} by more than a relative tolerance."""
+    bounds = limits + tolerance * np.maximum(1.0, np.abs(limits))
+    return np.asarray(~(values @ normals.T <= bounds).all(axis=1))
 
 
 def _compute_cost(flight: FlightData) -> float:

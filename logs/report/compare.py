@@ -31,7 +31,7 @@ from uavctl.records import Header
 class ComparedFlight(msgspec.Struct, frozen=True, kw_only=True):
     """One recording of a comparison: its name there, where it is from, and how its flight ended."""
 
-    name: str  # A to Z, and then A1, B1, ...
+    name: str  # A to Z, and then A1, B1, ..., unless it was given another
     recording: str
     config: str
     command: str
@@ -52,16 +52,21 @@ class LoadedFlight:
     parameters: Mapping[str, VehicleParameter]  # of the vehicle, as it told them
 
 
-def load_flights(paths: Sequence[Path], on_loaded: Callable[[], None] = lambda: None) -> tuple[LoadedFlight, ...]:
-    """Read the recordings of a comparison, named A, B, … in their order.
+def load_flights(
+    paths: Sequence[Path], on_loaded: Callable[[], None] = lambda: None, names: Sequence[str] = ()
+) -> tuple[LoadedFlight, ...]:
+    """Read the recordings of a comparison.
+
+    Args:
+        names: What they are called; else A, B, … in their order.
 
     Raises:
         RecordingError: One cannot be read, or nothing was flown in it; names it.
     """
     recordings = []
     for number, path in enumerate(paths):
-        name = ascii_uppercase[number % 26] + (str(number // 26) if number >= 26 else "")
-        recordings.append(_load_flight(path, name))
+        letter = ascii_uppercase[number % 26] + (str(number // 26) if number >= 26 else "")
+        recordings.append(_load_flight(path, names[number] if names else letter))
         on_loaded()
     return tuple(recordings)
 

@@ -10,20 +10,25 @@ from logs.report.compare import Figure, Match, Value
 _NONE = "–"
 
 
-def describe_match(match: Match) -> str:
-    """Return a sentence on how long a flight is the same as the first one, and where it departs from it."""
+def describe_match(match: Match, first: str) -> str:
+    """Return a sentence on how long a flight is the same as the first one, and where it departs from it.
+
+    Args:
+        first: Name of the first one.
+    """
     divergence = match.parting
     if divergence is None:
         identical_text = count(match.records, "record")
         return (
-            f"{match.name} is the same flight as A: {identical_text} alike, bit for bit (computing times do not count)."
+            f"{match.name} is the same flight as {first}: {identical_text} alike, bit for bit (computing times do not "
+            "count)."
         )
     if not match.records:
-        return f"{match.name} is another flight than A from its first record on."
+        return f"{match.name} is another flight than {first} from its first record on."
     field = f", {divergence.field}" if divergence.field else ""
     return (
-        f"{match.name} is the same as A for {count(match.records, 'record')}, up to {divergence.flight_s:.3f} s. Then "
-        f"{divergence.topic}{field}: {divergence.first} in A, {divergence.other} in {match.name}."
+        f"{match.name} is the same as {first} for {count(match.records, 'record')}, up to {divergence.flight_s:.3f} s. "
+        f"Then {divergence.topic}{field}: {divergence.first} in {first}, {divergence.other} in {match.name}."
     )
 
 

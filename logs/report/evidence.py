@@ -1,4 +1,4 @@
-"""Evidence of a flight: what its records show of positions, pushes, battery and silence, for the headline's rules."""
+"""Account of a recorded flight: what its records, figures and verdicts show. Headline and page are made from it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from logs.recording.design_view import AXIS_NUMBER
-from logs.recording.flight import FLOWN, FlightData
+from logs.recording.flight import FLOWN, FlightData, find_spans
 from logs.recording.summary import BLIND_S, FlightSummary
+from logs.report.battery import find_battery_faults
 from logs.report.excursion import Clearance, Excursion, find_excursions
+from logs.report.findings import Finding
 from logs.report.verdicts import Judgement, read_flown_config
 from uavctl.arrays import Array
 from uavctl.config import Config
@@ -38,7 +40,7 @@ class Push(NamedTuple):
 
 
 class FlightEvidence:
-    """What the records of a flight show."""
+    """What the records of a flight show, with its figures and verdicts."""
 
     def __init__(self, flight: FlightData, summary: FlightSummary, judged: Judgement) -> None:
         self.flight, self.summary, self.judged = flight, summary, judged
@@ -61,16 +63,7 @@ class FlightEvidence:
     @cached_property
     def armed_spans(self) -> list[tuple[float, float]]:
         """From when to when the vehicle was armed, by its heartbeats [s]."""
-        spans: list[tuple[float, float]] = []
-        since: float | None = None
-        for status in self.flight.vehicles:
-            at_s = self.to_seconds(status.at_ns)
-            if status.armed and since is None:
-                since = at_s
-            elif not status.armed and since is not None:
-                spans.append((since, at_s))
-                since = None
-        return spans if since is None else [*spans, (since, np.inf)]
+        return find_spans(((self.to_seconds(status.at_ns), status.armed) for status in self.flight.vehicles), np.inf)
 
     def is_armed(self, at_s: float) -> bool:
         """Return whether the vehicle was armed at a time, to a heartbeat's period."""
@@ -90,6 +83,11 @@ class FlightEvidence:
             if status.battery_v is not None and status.armed
         ]
         return np.array([at_s for at_s, _ in readings]), np.array([volts for _, volts in readings], dtype=np.float64)
+
+    @cached_property
+    def battery_faults(self) -> tuple[Finding, ...]:
+        """Findings on a battery that gave in while armed."""
+        return tuple(find_battery_faults(*self.battery_v))
 
     @cached_property
     def captured_s(self) -> Array:

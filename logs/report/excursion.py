@@ -10,12 +10,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from logs.recording.design_view import AXIS_NUMBER
 from logs.recording.flight import FLOWN, FlightData
 from logs.recording.summary import BLIND_S, RELATIVE_TOLERANCE, compute_box
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.records import Estimate
 
 GRAVE_M = 0.05  # beyond a limit: further than what a plan promises to keep now and then
@@ -122,7 +121,7 @@ def _iterate_excursions(clearance: Clearance) -> Iterator[Excursion]:
             )
 
 
-def _find_runs(outside: NDArray[np.bool_], t_s: Array) -> list[tuple[int, int]]:
+def _find_runs(outside: Flags, t_s: Array) -> list[tuple[int, int]]:
     """Return the first index of each run outside, and the one after it; runs close to each other are one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], outside, [False]]).astype(np.int8)))
     runs: list[tuple[int, int]] = []
@@ -140,7 +139,7 @@ def select_trusted_estimates(flight: FlightData) -> tuple[Estimate, ...]:
     return tuple(estimate for estimate in flight.estimates if estimate.age_s <= reach_s)
 
 
-def _collect_airborne_positions(flight: FlightData) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _collect_airborne_positions(flight: FlightData) -> tuple[Array, Array, Flags]:
     """Return times (n,) [s] and places (n, 3) [m] in the air, and at which of them the controller flew (n,)."""
     records = flight.truths or flight.estimates
     positions = [t.position_m for t in flight.truths] or [flight.design.position_of(e.mean) for e in flight.estimates]

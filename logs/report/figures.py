@@ -12,16 +12,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import get_decision_times_us
-from logs.report.plots import (
-    DASHED,
-    draw_path,
-    find_input_violations,
-    has_variation,
-    set_time_axis,
-    shade_fallback,
-    thin_samples,
-)
+from logs.recording.summary import find_input_violations, get_decision_times_us
+from logs.report.plots import DASHED, draw_path, has_variation, set_time_axis, shade_fallback, thin_samples
 from logs.report.svg import (
     PALETTE,
     Drawing,

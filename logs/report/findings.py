@@ -46,13 +46,19 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Headline:
-    """One line on what matters most in a recording, in colour and words, and the sentences below it."""
+class Banner:
+    """First line of a page: what matters most, in colour and words, and the sentences below it."""
 
-    tone: str  # GOOD, MIND or BAD
-    word: str  # what it comes to, in a few words
+    tone: str  # GOOD, CAUTION or BAD
+    word: str  # result in a few words, so that it is said without colour too
     text: str  # the rest of the line
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Headline(Banner):
+    """First line of the page of a recording, with the causes behind it."""
+
     at_s: float = 0.0  # moment to look at first
     cause: Cause = Cause.NOTHING_FOUND
     causes: tuple[Cause, ...] = ()  # all that were found, the gravest first

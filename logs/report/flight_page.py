@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from logs.recording.design_view import get_config_name
@@ -13,33 +12,27 @@ from logs.recording.flight import FlightData
 from logs.recording.output_files import write_atomically
 from logs.recording.reader import read
 from logs.recording.summary import FlightSummary, find_input_violations, find_state_violations, list_summary_rows
-from logs.report import figures, link_figures, page, plan_figures, plots
+from logs.report import figures, link_figures, origin_sections, plan_figures, plots, verdict_sections
 from logs.report.cursor import render_cursor_script
-from logs.report.excursion import find_excursions
+from logs.report.evidence import FlightEvidence
 from logs.report.headline import derive_headline
-from logs.report.origin_sections import make_origin_sections
-from logs.report.page import Mark, PageSection
-from logs.report.path_3d import draw_path_3d
+from logs.report.page import Mark, Part, Section, render_facts, render_list, render_note, render_page, render_table
+from logs.report.path_3d import can_draw_path_3d, draw_path_3d
 from logs.report.summary_text import describe_flight, describe_part_begin
-from logs.report.timeline import draw_timeline
-from logs.report.verdict_link import DelayVerdict, LinkVerdict
-from logs.report.verdict_sections import make_clocks_section, make_model_section, make_risk_section, make_verdict_rows
+from logs.report.timeline import describe_lanes, draw_timeline, list_hidden_texts
 from logs.report.verdicts import Judgement, judge_flight
 from uavctl.errors import UavctlError
 from uavctl.event_codes import EventCode
 from uavctl.number_text import format_number
 from uavctl.records import Event
 
-_LIMIT = Mark("dashed", "limit", "limit")
-_TARGET = Mark("dotted", "target", "target")
+_TRUTH = Mark("line", "truth", "true state", when=lambda e: e.flight.truths)
 _ESTIMATE = Mark("line", "estimate", "estimate")
-_OUTSIDE = Mark("cross", "limit", "outside")
-_EXIT = Mark("ring", "limit", "where it left its limits")
-_FURTHEST = Mark("cross", "limit", "furthest outside")
-_FALLBACK = Mark("band", "fallback", "fallback")
+_TARGET = Mark("dotted", "target", "target")
+_LIMIT = Mark("dashed", "limit", "limit")
+_FALLBACK = Mark("band", "fallback", "fallback", when=lambda e: e.flight.fallback_spans)
+_HORIZON = Mark("dotted", "muted", "horizon H")
 _NO_PLAN = "No plan was flown, so there is nothing to compare."
-_LATENESS = "lateness is from a tick's deadline to its start"
-_NO_TIMING = "No times were measured in this flight."
 
 # Of these every other text is another matter: what the vehicle says, who flies.
 _VERBATIM_EVENTS = frozenset({EventCode.VEHICLE_TEXT, EventCode.COMMAND_ACK, EventCode.HAND_OVER})
@@ -56,212 +49,214 @@ def write_report(flight: FlightData, summary: FlightSummary, path: Path, judged:
 
 def render_report(flight: FlightData, summary: FlightSummary, judged: Judgement | None = None) -> str:
     """Return the page of a flight as HTML."""
-    judged = judge_flight(flight) if judged is None else judged
-    header = flight.header
+    evidence = FlightEvidence(flight, summary, judge_flight(flight) if judged is None else judged)
+    header, headline = flight.header, derive_headline(evidence)
     name = get_config_name(header)
     title = f"Flight “{name}”" if name else "Flight"
-    title += ", a part" if describe_part_begin(flight) else ""
-    subtitle = f"{header.started_utc} · {header.command} · seed {header.seed}"
-    headline = derive_headline(flight, summary, judged)
-    return page.render_page(
-        title,
-        subtitle,
-        (),
-        _make_sections(flight, summary, judged),
-        top=page.render_banner(headline.tone, headline.word, headline.text, headline.reasons),
-        script=render_cursor_script(flight, headline.at_s),
+    return render_page(
+        f"{title}, a part" if describe_part_begin(flight) else title,
+        f"{header.started_utc} · {header.command} · seed {header.seed}",
+        SECTIONS,
+        evidence,
+        headline,
+        render_cursor_script(flight, headline.at_s),
     )
 
 
-def _make_sections(flight: FlightData, summary: FlightSummary, judged: Judgement) -> Iterator[PageSection]:
-    wide, narrow, marks, meanings = draw_timeline(flight)
-    yield PageSection("Timeline", "", page.render_wide_or_narrow(wide, narrow) + page.render_note(meanings), marks)
-    yield _make_path_section(flight)
-    yield _make_axes_section(flight)
-    yield _make_inputs_section(flight)
-    yield _make_age_section(flight, judged.verdicts.link)
-    for section in (
-        _make_link_section(flight, judged.verdicts.link),
-        _make_plans_section(flight),
-        _make_certificates_section(flight),
-        _make_timing_section(flight),
-        make_risk_section(judged.verdicts),
-        make_model_section(flight, judged),
-        make_clocks_section(flight, judged.verdicts),
-        *make_origin_sections(flight),
-    ):
-        yield replace(section, closed=True)
-    yield _make_events_section(flight)
-    yield _make_summary_section(flight, summary, judged)
+def _show_timeline(e: FlightEvidence) -> Iterator[Part]:
+    yield from draw_timeline(e.flight)
+    yield render_note(describe_lanes(e.flight))
 
 
-def _make_summary_section(flight: FlightData, summary: FlightSummary, judged: Judgement) -> PageSection:
-    facts = page.render_facts([*list_summary_rows(summary), *make_verdict_rows(judged.verdicts)])
-    return PageSection("Summary", "", page.render_list(describe_flight(flight, summary)) + facts)
+def _draw_paths(e: FlightEvidence) -> Iterator[Part]:
+    yield from plots.draw_path_views(e.flight)
+    yield from draw_path_3d(e.flight)
 
 
-def _make_path_section(flight: FlightData) -> PageSection:
-    drawing_3d = draw_path_3d(flight)
-    return PageSection(
-        "Path",
-        "",
-        page.render_grid([*plots.draw_path_views(flight), *(() if drawing_3d is None else (drawing_3d,))]),
-        (
-            *_make_truth_mark(flight),
-            _ESTIMATE,
-            *((Mark("planned", "plan", "plan, with its back-offs as ellipsoids"),) if drawing_3d is not None else ()),
-            Mark("dot", "sample", "position used"),
-            Mark("ring", "truth", "start"),
-            _TARGET if flight.moving_target else Mark("star", "target", "target"),
-            _LIMIT,
-            *((Mark("band", "limit", "space that a fence took"),) if plots.find_moving_limits(flight) else ()),
-            *((_EXIT, _FURTHEST) if find_excursions(flight) else ()),
-        ),
+def _draw_ages(e: FlightEvidence) -> Iterator[Part]:
+    yield figures.draw_age_figure(e.flight)
+    yield from link_figures.draw_link_in_flight(e.flight, e.judged.verdicts.link)
+
+
+def _explain_age(e: FlightEvidence) -> str:
+    return (
+        f"How many steps old the newest position was. A plan lasts H = {e.flight.design.horizon} steps; at age H the "
+        "fallback takes over."
     )
 
 
-def _make_axes_section(flight: FlightData) -> PageSection:
-    return PageSection(
-        "Each axis against its limits",
-        "The band along a limit is the largest reserve that the plan of the moment kept from it.",
-        page.render_grid(list(plots.draw_axes_over_time(flight))),
-        (
-            *_make_truth_mark(flight),
-            _ESTIMATE,
-            _TARGET,
-            _LIMIT,
-            Mark("band", "limit", "reserve kept"),
-            *((_OUTSIDE,) if find_state_violations(flight).any() else ()),
-            *_make_fallback_mark(flight),
-        ),
-    )
+def _show_link(e: FlightEvidence) -> Iterator[Part]:
+    verdict = e.judged.verdicts.link
+    yield verdict.text
+    yield from link_figures.draw_link_ages(e.flight, verdict)
 
 
-def _make_age_section(flight: FlightData, verdict: LinkVerdict) -> PageSection:
-    lost = (Mark("tick", "lost", "position lost"),) if flight.truths else ()
-    bound = (Mark("thin", "estimate", "lower bound in flight"),) if flight.link_estimates else ()
-    return PageSection(
-        "Age of information",
-        "How many steps old the newest position was. A plan lasts H steps; at age H the fallback takes over.",
-        page.render_grid([figures.draw_age_figure(flight), *link_figures.draw_link_in_flight(flight, verdict)]),
-        (
-            Mark("line", "estimate", "measured"),
-            *bound,
-            Mark("dashed", "limit", f"horizon H = {flight.design.horizon}; share of news that the design counts on"),
-            *((Mark("band", "limit", "delay configured"),) if verdict.delay is not None else ()),
-            *lost,
-            *_make_fallback_mark(flight),
-        ),
-    )
-
-
-def _make_link_section(flight: FlightData, verdict: LinkVerdict) -> PageSection:
-    drawings = list(link_figures.draw_link_ages(flight, verdict))
-    horizon = (Mark("dotted", "muted", f"horizon H = {flight.design.horizon}"),) if verdict.ages else ()
+def _explain_link(e: FlightEvidence) -> str:
+    """Return how to read the link's figures; delays are short of the truth where only the quickest one is known."""
     note = "The dashed line is what the design counts on, by the link of the configuration."
-    if verdict.delay is not None and verdict.delay.from_quickest:
-        note += _describe_quickest(verdict.delay)
-    return PageSection(
-        "The link, estimated against promised",
-        note,
-        page.render_paragraph(verdict.text) + (page.render_grid(drawings) if drawings else ""),
-        (Mark("line", "estimate", "measured"), Mark("dashed", "limit", "promised"), *horizon) if drawings else (),
-    )
-
-
-def _describe_quickest(delay: DelayVerdict) -> str:
-    """Return a sentence on delays where the sender's clock is known by the quickest arrival only."""
+    delay = e.judged.verdicts.link.delay
+    if delay is None or not delay.from_quickest:
+        return note
     if delay.latency_ms:
         return (
-            f" The shortest delay is taken to be {format_number(delay.latency_ms)} ms (clock.latency_s), as the "
+            f"{note} The shortest delay is taken to be {format_number(delay.latency_ms)} ms (clock.latency_s), as the "
             "sender's clock is only known by it."
         )
-    return " Delays are short of the quickest one, as the sender's clock is only known by it."
+    return f"{note} Delays are short of the quickest one, as the sender's clock is only known by it."
 
 
-def _make_certificates_section(flight: FlightData) -> PageSection:
-    drawings = list(plan_figures.draw_certificates(flight))
-    marks = [Mark("dot", role, name) for name, role in plan_figures.list_methods(flight)]
-    has_relaxed = any(drawing.key == "plan-slack" for drawing in drawings)
+def _draw_plans(e: FlightEvidence) -> Iterator[Part]:
+    yield from plots.draw_plans_against_flown(e.flight)
+    yield from figures.draw_plan_indices(e.flight)
+
+
+def _explain_certificates(e: FlightEvidence) -> str:
     slack_text = (
         "Slack is what state limits gave way by (light); the rest at the end of a plan may be missed, too (dark)."
-        if has_relaxed
-        else (
-            "Slack is what state limits give way by, so that there is a plan at all. No plan that was flown gave way "
-            "anywhere."
-        )
+        if plan_figures.select_relaxed_plans(e.flight)
+        else "Slack is what state limits give way by, so that there is a plan at all. No plan that was flown gave way "
+        "anywhere."
     )
-    return PageSection(
-        "Certificates and slack",
-        f"Each plan comes with a bound of the least cost there is: the gap between them is certified. "
-        f"{plan_figures.describe_methods(flight)}{slack_text}",
-        page.render_grid(drawings) if drawings else page.render_paragraph(_NO_PLAN),
-        tuple(marks) if drawings else (),
+    return (
+        "Each plan comes with a bound of the least cost there is: the gap between them is certified. "
+        f"{plan_figures.describe_methods(e.flight)}{slack_text}"
     )
 
 
-def _make_inputs_section(flight: FlightData) -> PageSection:
-    return PageSection(
-        "Inputs",
-        "The colour tells how far into its plan the controller was when it gave the input: from blue, the first step "
-        "of a plan, to orange, its last.",
-        page.render_grid(list(figures.draw_inputs(flight))),
-        (_LIMIT, *((_OUTSIDE,) if find_input_violations(flight).any() else ()), *_make_fallback_mark(flight)),
+def _explain_timing(e: FlightEvidence) -> str:
+    lateness_text = (
+        "in virtual time no tick is late"
+        if e.flight.virtual_time
+        else "lateness is from a tick's deadline to its start"
     )
+    return f"Decision time is spent in the core at ticks that solve; {lateness_text}."
 
 
-def _make_plans_section(flight: FlightData) -> PageSection:
-    drawings = [*plots.draw_plans_against_flown(flight), *figures.draw_plan_indices(flight)]
-    flown = Mark("line", "truth", "flown" if flight.truths else "flown (estimate)")
-    marks = (flown, Mark("planned", "plan", "plan, from its first state"), Mark("band", "plan", "back-off of the plan"))
-    return PageSection(
-        "Plans against what was flown",
-        "A few plans on the way to the target, each with the back-off that it keeps from a limit at that stage.",
-        page.render_grid(drawings) if drawings else page.render_paragraph(_NO_PLAN),
-        marks if drawings else (),
-    )
-
-
-def _make_timing_section(flight: FlightData) -> PageSection:
-    drawings = list(figures.draw_timing(flight))
-    lateness_text = "in virtual time no tick is late" if flight.virtual_time else _LATENESS
-    return PageSection(
-        "Time taken",
-        f"Decision time is spent in the core at ticks that solve; {lateness_text}.",
-        page.render_grid(drawings) if drawings else page.render_paragraph(_NO_TIMING),
-    )
-
-
-def _make_events_section(flight: FlightData) -> PageSection:
+def _show_events(e: FlightEvidence) -> Iterator[Part]:
+    """Return a table of the events by kind, with the first text of each."""
     events_by_kind: dict[tuple[str, str, str], list[Event]] = {}
-    for event in flight.events:
+    for event in e.flight.events:
         text = event.text if event.code in _VERBATIM_EVENTS else ""
         events_by_kind.setdefault((event.severity.value, event.code, text), []).append(event)
-    event_rows = [
+    rows = [
         (
-            f"{flight.seconds([events[0].at_ns])[0]:.2f}",
+            f"{e.to_seconds(events[0].at_ns):.2f}",
             severity,
             code,
-            str(sum(e.count for e in events)),
+            str(sum(event.count for event in events)),
             events[0].text,
         )
         for (severity, code, _), events in events_by_kind.items()
     ]
-    columns = ("first at [s]", "severity", "event", "times", "as first told")
-    body = (
-        page.render_table(columns, event_rows, frozenset({0, 3}))
-        if event_rows
-        else page.render_paragraph("There were none.")
-    )
-    return PageSection("Events", "", body)
+    if rows:
+        yield render_table(("first at [s]", "severity", "event", "times", "as first told"), rows, frozenset({0, 3}))
 
 
-def _make_truth_mark(flight: FlightData) -> tuple[Mark, ...]:
-    return (Mark("line", "truth", "true state"),) if flight.truths else ()
+def _show_summary(e: FlightEvidence) -> Iterator[Part]:
+    yield render_list(describe_flight(e.flight, e.summary))
+    verdict_rows = verdict_sections.make_verdict_rows(e.judged.verdicts)
+    yield render_facts([*list_summary_rows(e.summary), *verdict_rows])
 
 
-def _make_fallback_mark(flight: FlightData) -> tuple[Mark, ...]:
-    return (_FALLBACK,) if flight.fallback_spans else ()
+SECTIONS: tuple[Section[FlightEvidence], ...] = (
+    Section("Timeline", _show_timeline, legend=lambda e: list_hidden_texts(e.flight)),
+    Section(
+        "Path",
+        _draw_paths,
+        legend=(
+            _TRUTH,
+            _ESTIMATE,
+            Mark(
+                "planned", "plan", "plan, with its back-offs as ellipsoids", when=lambda e: can_draw_path_3d(e.flight)
+            ),
+            Mark("dot", "sample", "position used"),
+            Mark("ring", "truth", "start"),
+            Mark("dotted", "target", "target", when=lambda e: e.flight.moving_target),
+            Mark("star", "target", "target", when=lambda e: not e.flight.moving_target),
+            _LIMIT,
+            Mark("band", "limit", "space that a fence took", when=lambda e: plots.find_moving_limits(e.flight)),
+            Mark("ring", "limit", "where it left its limits", when=lambda e: e.excursions),
+            Mark("cross", "limit", "furthest outside", when=lambda e: e.excursions),
+        ),
+    ),
+    Section(
+        "Each axis against its limits",
+        lambda e: plots.draw_axes_over_time(e.flight),
+        note="The band along a limit is the largest reserve that the plan of the moment kept from it.",
+        legend=(
+            _TRUTH,
+            _ESTIMATE,
+            _TARGET,
+            _LIMIT,
+            Mark("band", "limit", "reserve kept"),
+            Mark("cross", "limit", "outside", when=lambda e: find_state_violations(e.flight).any()),
+            _FALLBACK,
+        ),
+    ),
+    Section(
+        "Inputs",
+        lambda e: figures.draw_inputs(e.flight),
+        note="The colour tells how far into its plan the controller was when it gave the input: from blue, the first "
+        "step of a plan, to orange, its last.",
+        legend=(
+            _LIMIT,
+            Mark("cross", "limit", "outside", when=lambda e: find_input_violations(e.flight).any()),
+            _FALLBACK,
+        ),
+    ),
+    Section(
+        "Age of information",
+        _draw_ages,
+        note=_explain_age,
+        legend=(
+            Mark("line", "estimate", "measured"),
+            Mark("thin", "estimate", "lower bound in flight", when=lambda e: e.flight.link_estimates),
+            Mark("dashed", "limit", "horizon H; share of news that the design counts on"),
+            Mark("band", "limit", "delay configured", when=lambda e: e.judged.verdicts.link.delay is not None),
+            Mark("tick", "lost", "position lost", when=lambda e: e.flight.truths),
+            _FALLBACK,
+        ),
+    ),
+    Section(
+        "The link, estimated against promised",
+        _show_link,
+        note=_explain_link,
+        legend=(Mark("line", "estimate", "measured"), Mark("dashed", "limit", "promised"), _HORIZON),
+        is_closed=True,
+    ),
+    Section(
+        "Plans against what was flown",
+        _draw_plans,
+        note="A few plans on the way to the target, each with the back-off that it keeps from a limit at that stage.",
+        legend=(
+            Mark("line", "truth", "flown", when=lambda e: e.flight.truths),
+            Mark("line", "truth", "flown (estimate)", when=lambda e: not e.flight.truths),
+            Mark("planned", "plan", "plan, from its first state"),
+            Mark("band", "plan", "back-off of the plan"),
+        ),
+        otherwise=_NO_PLAN,
+        is_closed=True,
+    ),
+    Section(
+        "Certificates and slack",
+        lambda e: plan_figures.draw_certificates(e.flight),
+        note=_explain_certificates,
+        legend=lambda e: (Mark("dot", role, name) for name, role in plan_figures.list_methods(e.flight)),
+        otherwise=_NO_PLAN,
+        is_closed=True,
+    ),
+    Section(
+        "Time taken",
+        lambda e: figures.draw_timing(e.flight),
+        note=_explain_timing,
+        otherwise="No times were measured in this flight.",
+        is_closed=True,
+    ),
+    *verdict_sections.SECTIONS,
+    *origin_sections.SECTIONS,
+    Section("Events", _show_events, otherwise="There were none."),
+    Section("Summary", _show_summary),
+)
 
 
 def main() -> int:

@@ -5,19 +5,19 @@ Each rule looks at one kind of cause and yields its findings. `logs.report.cause
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
+from operator import attrgetter
 from pathlib import Path
 
 from logs.recording.flight import FLOWN, FlightData
 from logs.recording.reader import read
-from logs.recording.summary import FlightSummary, summarise
+from logs.recording.summary import summarise
 from logs.report.evidence import MIN_STALL_S, FlightEvidence
 from logs.report.findings import Finding, Headline, make_headline, metres, seconds, sort_findings
 from logs.report.reasons import describe_reasons
 from logs.report.rules_loss import (
     describe_depth,
     describe_source,
-    find_battery_fault,
     find_blind_flight,
     find_excursion,
     find_process_pause,
@@ -43,7 +43,7 @@ from logs.report.rules_positions import (
     find_wrong_positions,
 )
 from logs.report.rules_takeover import find_failsafe, find_takeover, find_vehicle_texts
-from logs.report.verdicts import Judgement, judge_flight
+from logs.report.verdicts import judge_flight
 from uavctl.cause import Cause
 from uavctl.errors import RecordingError
 from uavctl.records import ControlMode
@@ -51,9 +51,8 @@ from uavctl.records import ControlMode
 _START_S = 1.0  # it is still about where it began
 
 
-def derive_headline(flight: FlightData, summary: FlightSummary, judged: Judgement) -> Headline:
-    """Return what matters most in a flight; `summary` and `judged` are its figures and verdicts."""
-    evidence = FlightEvidence(flight, summary, judged)
+def derive_headline(evidence: FlightEvidence) -> Headline:
+    """Return what matters most in a flight."""
     findings = sort_findings(finding for rule in RULES for finding in rule(evidence))
     if not findings:
         return make_headline([_make_clear_finding(evidence)], reasons=describe_reasons(evidence, None))
@@ -70,7 +69,7 @@ def derive_headline_of_file(path: Path) -> Headline | None:
         flight = FlightData.from_records(read(path), path)
     except RecordingError:
         return None
-    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight))
+    return derive_headline(FlightEvidence(flight, summarise(flight, wall_s=None), judge_flight(flight)))
 
 
 _END_CAUSES = frozenset(
@@ -142,8 +141,8 @@ def _describe_clearance(e: FlightEvidence) -> str:
     return f"inside its walls {period}, {nearest_text}{describe_source(e, at_s)}"
 
 
-RULES: tuple[Callable[[FlightEvidence], Iterator[Finding]], ...] = (
-    find_battery_fault,
+RULES: tuple[Callable[[FlightEvidence], Iterable[Finding]], ...] = (
+    attrgetter("battery_faults"),
     find_excursion,
     find_vehicle_loss,
     find_recording_cut,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from logs.recording.flight import FlightData
-from logs.report import page
-from logs.report.page import PageSection
+from logs.report.evidence import FlightEvidence
+from logs.report.page import Part, Section, render_facts, render_folded, render_table
 
 # Numbers that say no more than that it hardly ever happens are told as one.
 _NEGLIGIBLE = 1e-6
@@ -26,25 +25,24 @@ _DESIGN = {
 }
 
 
-def make_origin_sections(flight: FlightData) -> Iterator[PageSection]:
-    """Return the sections on parameters and on how the flight was made."""
-    design = list(_list_design_facts(flight.header.design))
-    parts = [page.render_facts(design)] if design else []
-    assumptions = list(_list_assumptions(flight.header.design))
+def _show_configuration(e: FlightEvidence) -> Iterator[Part]:
+    header = e.flight.header
+    design, assumptions = list(_list_design_facts(header.design)), list(_list_assumptions(header.design))
+    if design:
+        yield render_facts(design)
     if assumptions:
-        columns = ("assumption", "value", "limit", "holds")
-        parts.append(
-            page.render_folded("Assumptions of the design", page.render_table(columns, assumptions, frozenset({1, 2})))
-        )
-    if flight.checks:
-        columns = ("check before arming", "state", "found", "wanted")
-        check_rows = [(check.name, check.state, check.value, check.want) for check in flight.checks]
-        parts.append(page.render_folded("Checked before arming", page.render_table(columns, check_rows, frozenset())))
-    header = flight.header
-    parts.append(page.render_folded("Configuration", header.config_toml))
-    yield PageSection("Configuration and parameters", "", page.join(parts))
-    versions = [("Design", header.design_id), ("Processor", header.cpu), *sorted(header.versions.items())]
-    yield PageSection("Made with", "", page.render_facts(versions))
+        table = render_table(("assumption", "value", "limit", "holds"), assumptions, frozenset({1, 2}))
+        yield render_folded("Assumptions of the design", table)
+    if e.flight.checks:
+        rows = [(check.name, check.state, check.value, check.want) for check in e.flight.checks]
+        table = render_table(("check before arming", "state", "found", "wanted"), rows, frozenset())
+        yield render_folded("Checked before arming", table)
+    yield render_folded("Configuration", header.config_toml)
+
+
+def _show_versions(e: FlightEvidence) -> Iterator[Part]:
+    header = e.flight.header
+    yield render_facts([("Design", header.design_id), ("Processor", header.cpu), *sorted(header.versions.items())])
 
 
 def _list_design_facts(design: Mapping[str, object]) -> Iterator[tuple[str, str]]:
@@ -80,3 +78,9 @@ def _list_assumptions(design: Mapping[str, object]) -> Iterator[tuple[str, ...]]
                 _format_value(assumption.get("limit")),
                 "yes" if assumption.get("ok") else "no",
             )
+
+
+SECTIONS: tuple[Section[FlightEvidence], ...] = (
+    Section("Configuration and parameters", _show_configuration, is_closed=True),
+    Section("Made with", _show_versions, is_closed=True),
+)

@@ -1,27 +1,38 @@
-"""HTML of a report: one file with nothing from outside, whole without its script, too."""
+"""Kit of all pages: a page is a list of sections, each a title, what it shows, and when.
+
+A page is one HTML file with nothing from outside, whole without its script, too.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from itertools import groupby
 from string import Template
-from typing import Literal, cast
+from typing import Any, Generic, Literal, TypeVar, cast
 
 import jinja2
 from markupsafe import Markup, escape
 
+from logs.report.findings import Banner
 from logs.report.svg import FONT, Drawing, make_css_variables
 
 NOTHING = Markup("")
 _MIN_CONTENTS_SECTIONS = 9  # sections from which on a page has a list of them
 
-
+View = TypeVar("View", contravariant=True)
+Part = Markup | str | Drawing  # HTML, a sentence, or a figure
 MarkKind = Literal[
     "line", "thin", "dashed", "dotted", "planned", "dot", "ring", "star", "cross", "tick", "band", "marker"
 ]
+
+
+def is_always_shown(_: object) -> bool:
+    """Return True: the condition of what every page has."""
+    return True
 
 
 @dataclass(frozen=True)
@@ -33,22 +44,61 @@ class Mark:
     text: str
     path: str = ""  # of a marker
     full: bool = False
+    when: Callable[[Any], object] = is_always_shown  # whether the page of a view has such marks
 
 
 @dataclass(frozen=True)
-class PageSection:
-    """One section of a page: heading, a note on how to read it, its HTML, and its legend."""
+class Section(Generic[View]):
+    """One row of a page's list: a title, what stands below it, and when the page has it.
+
+    Attributes:
+        title: Heading.
+        parts: Returns figures, sentences and HTML of a view, in their order; neighbouring figures share a grid.
+        when: Returns whether the page of a view has this section.
+        note: How to read it.
+        legend: Meaning of the marks, shown where the section has a figure.
+        otherwise: Sentence where there are no parts; without one, such a section is left out.
+        is_closed: It is behind its title until it is opened, as what is rarely looked at.
+    """
+
+    title: str
+    parts: Callable[[View], Iterable[Part]]
+    when: Callable[[View], object] = is_always_shown
+    note: str | Callable[[View], str] = ""
+    legend: Iterable[Mark] | Callable[[View], Iterable[Mark]] = ()
+    otherwise: str = ""
+    is_closed: bool = False
+
+
+@dataclass(frozen=True)
+class _FilledSection:
+    """Section of the page of one view, as the template takes it."""
 
     title: str
     note: str
     body: Markup
-    legend: tuple[Mark, ...] = ()
-    closed: bool = False  # behind its title until it is opened, as what is rarely looked at
+    legend: tuple[Mark, ...]
+    closed: bool
 
     @property
     def anchor(self) -> str:
         """Its name in links."""
         return "on-" + re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
+
+
+def _fill_sections(sections: Iterable[Section[View]], view: View) -> Iterator[_FilledSection]:
+    for section in sections:
+        if not section.when(view):
+            continue
+        parts = list(section.parts(view))
+        if not parts and not section.otherwise:
+            continue
+        note = section.note if isinstance(section.note, str) else section.note(view)
+        legend: tuple[Mark, ...] = ()
+        if any(isinstance(part, Drawing) for part in parts):
+            marks = section.legend(view) if callable(section.legend) else section.legend
+            legend = tuple(mark for mark in marks if mark.when(view))
+        yield _FilledSection(section.title, note, render_parts(parts or [section.otherwise]), legend, section.is_closed)
 
 
 @cache
@@ -70,44 +120,39 @@ def _render_macro(macro: str, *arguments: object) -> Markup:
 def render_page(
     title: str,
     subtitle: str,
-    sentences: Iterable[str],
-    sections: Iterable[PageSection],
-    heading: str = "What happened",
-    top: Markup = NOTHING,
+    sections: Iterable[Section[View]],
+    view: View,
+    banner: Banner | None = None,
     script: str = "",
 ) -> str:
     """Return a complete HTML document.
 
     Args:
-        title: Plain text, as are `subtitle`, `story` and its `heading`.
-        top: HTML that stands before all else but the title.
+        title: Plain text, as is `subtitle`.
+        sections: The page's list, in its order.
+        view: What the page is about; each section takes what it shows from it.
         script: JavaScript of the page's end, before that of zoom and pan; the page is whole without it.
     """
     css = Template(resources.files("logs.report").joinpath("page.css").read_text(encoding="utf-8"))
     style = Markup(css.substitute(light=make_css_variables(False), dark=make_css_variables(True), font=FONT))
-    sentence_list = list(sentences)
-    all_sections = [*([PageSection(heading, "", render_list(sentence_list))] if sentence_list else ()), *sections]
+    filled = list(_fill_sections(sections, view))
+    top = NOTHING
+    if banner is not None:
+        top = _render_macro("banner", banner.tone, banner.word, banner.text, list(banner.reasons))
     code = Markup(script + resources.files("logs.report").joinpath("zoom.js").read_text(encoding="utf-8"))
-    return str(
-        _render_macro(
-            "document", title, subtitle, top, all_sections, len(all_sections) >= _MIN_CONTENTS_SECTIONS, style, code
-        )
-    ).lstrip()
+    has_contents = len(filled) >= _MIN_CONTENTS_SECTIONS
+    return str(_render_macro("document", title, subtitle, top, filled, has_contents, style, code)).lstrip()
 
 
-def render_banner(tone: str, title: str, text: str, sentences: Iterable[str]) -> Markup:
-    """Return the line on what matters most as HTML, with the sentences below it.
-
-    Args:
-        tone: "good", "mind" or "bad", for its colour.
-        word: What it comes to, so that it is said without colour, too.
-    """
-    return _render_macro("banner", tone, title, text, list(sentences))
-
-
-def join(parts: Iterable[Markup]) -> Markup:
-    """Return pieces of HTML one after another."""
-    return NOTHING.join(parts)
+def render_parts(parts: Iterable[Part]) -> Markup:
+    """Return parts as HTML: figures side by side where there is room, sentences as paragraphs."""
+    rendered = []
+    for are_drawings, group in groupby(parts, key=lambda part: isinstance(part, Drawing)):
+        if are_drawings:
+            rendered.append(_render_grid([part for part in group if isinstance(part, Drawing)]))
+        else:
+            rendered += [part if isinstance(part, Markup) else _render_macro("paragraph", part) for part in group]
+    return NOTHING.join(rendered)
 
 
 def render_list(sentences: Iterable[str]) -> Markup:
@@ -115,15 +160,8 @@ def render_list(sentences: Iterable[str]) -> Markup:
     return _render_macro("items", sentences, "story")
 
 
-def render_grid(drawings: Sequence[Drawing]) -> Markup:
-    """Return figures as HTML, two beside each other where there is room."""
-    return _render_macro("figures", [(drawing.key, "", _add_label(drawing)) for drawing in drawings])
-
-
-def render_wide_or_narrow(wide: Drawing, narrow: Drawing) -> Markup:
-    """Return one figure as HTML in two drawings: for wide pages and for phones."""
-    drawings = ((wide, " wide broad"), (narrow, " wide narrow"))
-    return _render_macro("figures", [(drawing.key, kind, _add_label(drawing)) for drawing, kind in drawings])
+def _render_grid(drawings: Sequence[Drawing]) -> Markup:
+    return _render_macro("figures", [(drawing.key, drawing.kind, _add_label(drawing)) for drawing in drawings])
 
 
 def _add_label(drawing: Drawing) -> Markup:
@@ -158,11 +196,6 @@ def render_table(
     return _render_macro("table", columns, rows, numbers, f"many {kind}".rstrip(), remarks)
 
 
-def render_paragraph(text: str) -> Markup:
-    """Return plain text as an HTML paragraph."""
-    return _render_macro("paragraph", text)
-
-
 def render_strong(text: str) -> Markup:
     """Return plain text as an HTML paragraph that stands out."""
     return _render_macro("strong", text)
@@ -176,8 +209,3 @@ def render_note(text: str) -> Markup:
 def render_folded(title: str, body: str) -> Markup:
     """Return HTML, or long plain text, behind a line that opens it."""
     return _render_macro("folded", title, body if isinstance(body, Markup) else _render_macro("plain", body))
-
-
-def render_legend(marks: Iterable[Mark]) -> Markup:
-    """Return what marks mean as HTML."""
-    return _render_macro("legend", marks)

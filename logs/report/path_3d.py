@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -32,13 +33,15 @@ _DROP_LINES = 12  # lines from the path to the floor
 _PROJECTION = VIEWS["deep"][1]
 
 
-def draw_path_3d(flight: FlightData) -> Drawing | None:
-    """Draw path, plans with their spread, limits and target in 3D.
+def can_draw_path_3d(flight: FlightData) -> bool:
+    """Return whether the plant moves in three axes and a position is known."""
+    return len(flight.design.axes) >= 3 and len(_get_flown_path_m(flight)) > 0
 
-    None for a plant that does not move in three axes, or where no position is known.
-    """
-    if len(flight.design.axes) < 3 or not len(_get_flown_path_m(flight)):
-        return None
+
+def draw_path_3d(flight: FlightData) -> Iterator[Drawing]:
+    """Draw path, plans with their spread, limits and target in 3D, if they can be drawn."""
+    if not can_draw_path_3d(flight):
+        return
     path_m, key = _get_flown_path_m(flight), "path-3d"
     lower, upper = _find_room_corners(flight.design, path_m)
     with open_canvas(key, 3.7) as canvas:
@@ -57,7 +60,7 @@ def draw_path_3d(flight: FlightData) -> Drawing | None:
             mark_excursion(ax, worst, *project_3d(np.array([worst.exit_m, worst.worst_m])))
         ax.margins(0.03)
     label = "Path in three dimensions, seen from the south-east and above, within the position limits"
-    return Drawing(key, canvas.svg, label)
+    yield Drawing(key, canvas.svg, label)
 
 
 def project_3d(places_m: Array) -> Array:

@@ -44,11 +44,14 @@ def draw_certificates(flight: FlightData) -> Iterator[Drawing]:
     """Draw the certified gap of each plan, and the slack of those in which a constraint gave way."""
     if has_variation(np.array([plan.gap for plan in flight.plans])):
         yield _draw_gaps(flight)
-    relaxed_plans = [
-        plan for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE
-    ]
-    if len(relaxed_plans) > 1:
+    relaxed_plans = select_relaxed_plans(flight)
+    if relaxed_plans:
         yield _draw_slack(flight, relaxed_plans)
+
+
+def select_relaxed_plans(flight: FlightData) -> list[Plan]:
+    """Return the flown plans in which a constraint gave way."""
+    return [plan for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE]
 
 
 def _draw_gaps(flight: FlightData) -> Drawing:

@@ -8,17 +8,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from logs.recording.design_view import AXIS_NUMBER, DesignView
 from logs.recording.flight import FlightData
-from logs.recording.summary import (
-    RELATIVE_TOLERANCE,
-    WIRE_TOLERANCE,
-    compute_box,
-    compute_limits,
-    compute_position_errors_m,
-)
+from logs.recording.summary import compute_box, compute_position_errors_m, find_state_violations
 from logs.report.excursion import Excursion, find_excursions, select_trusted_estimates
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from uavctl.arrays import Array
@@ -41,6 +34,8 @@ VIEWS: dict[str, tuple[tuple[str, ...], Array]] = {
     "side": (("east", "down"), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])),
     "deep": ((), np.array([[0.42, 1.0, 0.0], [0.36, -0.12, -1.0]])),
 }
+# Key, title, and the axes across and up.
+PATH_VIEWS = (("path-above", "From above", ("east", "north")), ("path-side", "From the south", ("east", "down")))
 RATE_NAMES = {"north": "speed north", "east": "speed east", "down": "climb rate"}
 
 # Text beside a mark that is to be seen: of the limits' colour, on a ground that keeps it readable.
@@ -81,9 +76,9 @@ def find_moving_limits(flight: FlightData) -> list[MovingLimit]:
 
 def draw_path_views(flight: FlightData) -> Iterator[Drawing]:
     """Draw the path from above, and from the side if the plant moves vertically."""
-    yield draw_path_view(flight, "path-above", "From above", ("east", "north"))
-    if "down" in flight.design.axes:
-        yield draw_path_view(flight, "path-side", "From the south", ("east", "down"))
+    for key, title, axes_shown in PATH_VIEWS:
+        if "down" not in axes_shown or "down" in flight.design.axes:
+            yield draw_path_view(flight, key, title, axes_shown)
 
 
 def draw_path_view(flight: FlightData, key: str, title: str, axes_shown: tuple[str, str]) -> Drawing:
@@ -265,35 +260,14 @@ def _draw_state(flight: FlightData, axis: str, index: int, y_label: str, title: 
             flight.seconds([t.at_ns for t in flight.truths]), np.array([sign * t.state[index] for t in flight.truths])
         )
         ax.plot(truth_s, truth, color=colour("truth"), lw=1.0)
-        _draw_target(ax, flight, index, sign)
+        draw_target(ax, flight, index, sign)
         steps = flight.steps
         ax.plot(steps.t_s[outside], sign * steps.state[outside, index], "x", ms=6, mew=1.6, color=colour("limit"))
         set_time_axis(ax, flight)
     return Drawing(key, canvas.svg, f"{title} over time against its limits")
 
 
-def find_state_violations(flight: FlightData, index: int) -> NDArray[np.bool_]:
-    """Return at which flown boundaries a limit that a state has a part in is violated (n,)."""
-    states, limits = flight.steps.state, compute_limits(flight, flight.steps.t_s)
-    rows = np.flatnonzero([normal[index] != 0.0 for normal in flight.design.c_x])
-    return _find_violations(states, np.array(flight.design.c_x)[rows], limits[:, rows], RELATIVE_TOLERANCE)
-
-
-def find_input_violations(flight: FlightData, number: int) -> NDArray[np.bool_]:
-    """Return at which flown boundaries a limit that an input has a part in is violated, as decided or applied (n,)."""
-    design, steps = flight.design, flight.steps
-    rows = np.flatnonzero([normal[number] != 0.0 for normal in design.c_u])
-    c, b = np.array(design.c_u)[rows], np.array(design.b_u)[rows]
-    outside = ~np.isnan(steps.decided).any(axis=1) & _find_violations(steps.decided, c, b, RELATIVE_TOLERANCE)
-    return outside | _find_violations(steps.input, c, b, WIRE_TOLERANCE) if steps.from_truth else outside
-
-
-def _find_violations(values: Array, c: Array, b: Array, tolerance: float) -> NDArray[np.bool_]:
-    normals = c.reshape(-1, values.shape[1])
-    return np.asarray(~(values @ normals.T <= b + tolerance * np.maximum(1.0, np.abs(b))).all(axis=1))
-
-
-def _draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
+def draw_target(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
     """Draw the target of a state over time: steps between waypoints, or a trajectory."""
     t_s, states = flight.targets
     ends_s = np.append(t_s, flight.duration_s)

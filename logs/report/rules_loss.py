@@ -9,7 +9,6 @@ import numpy as np
 
 from logs.recording.flight import FLOWN
 from logs.recording.notes import NoteKind
-from logs.report.battery import find_battery_faults
 from logs.report.evidence import MIN_STALL_S, FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion
 from logs.report.findings import Finding, metres, seconds
@@ -47,11 +46,6 @@ def describe_source(e: FlightEvidence, at_s: float) -> str:
     return f" (by {source}: the true state is unknown)"
 
 
-def find_battery_fault(e: FlightEvidence) -> Iterator[Finding]:
-    """Find a battery that gave in."""
-    yield from find_battery_faults(*e.battery_v)
-
-
 def find_excursion(e: FlightEvidence) -> Iterator[Finding]:
     """Find where it left the limits of its position."""
     for worst in e.excursions[:1]:
@@ -69,7 +63,7 @@ def _describe_circumstances(e: FlightEvidence, excursion: Excursion) -> str:
     max_error_m = float(errors_m.max(initial=0.0))
     if max_error_m > WRONG_POSITION_M:
         text = f", flown on positions that were {metres(max_error_m)} off"
-    if e.estimate_push(excursion) is not None and not any(find_battery_fault(e)):
+    if e.estimate_push(excursion) is not None and not e.battery_faults:
         text += " while wind carried it" if text else ", carried by wind"
     if e.find_decision(excursion.worst_s).mode in (ControlMode.LAND, ControlMode.STOPPED):
         text += ", after it was let go" if e.flight.breach is not None else ", in the vehicle's own landing"

@@ -18,10 +18,9 @@ from logs.recording.summary import (
 )
 from logs.report.evidence import HEARTBEAT_S, FlightEvidence
 from logs.report.findings import Finding, metres, seconds
-from logs.report.rules_loss import NEGLIGIBLE_SHARE, find_battery_fault
+from logs.report.rules_loss import NEGLIGIBLE_SHARE
 from logs.report.rules_takeover import find_external_exit
-from logs.report.verdict_risk import Flags
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.cause import BAD, CAUTION, Cause
 from uavctl.event_codes import EventCode
 from uavctl.records import ControlMode, Severity
@@ -242,7 +241,7 @@ def find_wind_push(e: FlightEvidence) -> Iterator[Finding]:
     flight_end_s = (
         e.breach_s if external_exit is None else min(e.breach_s, external_exit[0] - HEARTBEAT_S)
     )  # its mode is told that late
-    if at_s is None or at_s >= flight_end_s or any(find_battery_fault(e)):
+    if at_s is None or at_s >= flight_end_s or e.battery_faults:
         return
     until_s = next(
         (

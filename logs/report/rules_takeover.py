@@ -11,11 +11,11 @@ from logs.recording.flight import FLOWN
 from logs.report.evidence import FlightEvidence
 from logs.report.findings import Finding, seconds
 from logs.report.rules_loss import HEARTBEAT_TIMEOUT_S
-from logs.report.vehicle_texts import FAILSAFE_MODES, classify_text
+from logs.report.vehicle_texts import FAILSAFE_MODES, classify_texts
 from uavctl.cause import Cause
 from uavctl.event_codes import EventCode
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.records import Severity, VehicleStatus
+from uavctl.records import VehicleStatus
 
 _FAILSAFE_CAUSES = frozenset(
     {Cause.VEHICLE_FENCE, Cause.BATTERY_LOW, Cause.VEHICLE_POSITION_LOST, Cause.VEHICLE_FAILSAFE}
@@ -26,19 +26,17 @@ _FENCE_ENDS = frozenset({Cause.VEHICLE_FENCE, Cause.FENCE_LANDED})
 
 def find_vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
     """Find what the vehicle said that a pilot must know, each cause once."""
-    reported_causes: set[Cause] = set()
     last_change = ""  # the change of mode that was told last: one text after another tells of the same
-    for event in e.flight.events:
+    texts = [
+        event
+        for event in e.flight.events
+        if event.code == EventCode.VEHICLE_TEXT and e.is_armed(e.to_seconds(event.at_ns))
+    ]
+    for event, cause in classify_texts(texts, lambda event: event.severity):
         at_s = e.to_seconds(event.at_ns)
-        if event.code != EventCode.VEHICLE_TEXT or not e.is_armed(at_s):
-            continue
-        is_error = event.severity is Severity.ERROR
-        cause = classify_text(event.text, is_error=is_error, is_warning=is_error or event.severity is Severity.WARNING)
-        if cause is not None and cause not in reported_causes:
-            reported_causes.add(cause)
-            previous_change, last_change = last_change, _describe_mode_change(e, at_s)
-            mode = "" if last_change == previous_change else last_change
-            yield Finding(cause, at_s, f'it said "{event.text.strip()}" at {seconds(at_s)}{mode}')
+        previous_change, last_change = last_change, _describe_mode_change(e, at_s)
+        mode = "" if last_change == previous_change else last_change
+        yield Finding(cause, at_s, f'it said "{event.text.strip()}" at {seconds(at_s)}{mode}')
 
 
 def _describe_mode_change(e: FlightEvidence, at_s: float) -> str:

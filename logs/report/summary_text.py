@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,15 +19,14 @@ _SETTLING_SHARE = 0.05
 def describe_flight(flight: FlightData, summary: FlightSummary) -> list[str]:
     """Return sentences on a flight that neither headline nor summary has, each made from its data."""
     if summary.final_error_m is None:
-        return [*_describe_part(flight), *_describe_cut(flight)]
+        return [*_describe_part(flight), *_describe_rest(flight)]
     course = _describe_trajectory(flight) if summary.trajectory else _describe_waypoints(flight)
     return [
         *_describe_part(flight),
         *_describe_engagement(flight),
         *course,
-        *_describe_fallback(flight, summary),
         *_describe_relaxed_plan(flight),
-        *_describe_cut(flight),
+        *_describe_rest(flight),
     ]
 
 
@@ -52,37 +51,12 @@ def _describe_engagement(flight: FlightData) -> list[str]:
     return [f"The controller took over {format_number(begun_s)} s after the first tick."] if begun_s else []
 
 
-def _describe_cut(flight: FlightData) -> list[str]:
-    """Return a sentence on why the recording ends before the flight does; empty if it does not."""
-    if not flight.notes:
-        return []
-    note = flight.notes[-1]
-    if note.kind is NoteKind.RECOVERED:
-        return [f"The recording was {note.text}."]
-    if note.kind is NoteKind.CONTINUED:
-        return ["The flight goes on in the next file."]
-    if flight.breaks_off:
-        return [
-            "The recording breaks off here: it was not closed in order (the process was killed, the power failed, or "
-            "the file was cut)."
-        ]
-    return []
-
-
-def _describe_fallback(flight: FlightData, s: FlightSummary) -> list[str]:
-    """Return a sentence on when and why the fallback took over; none if it never did."""
-    if not s.fallbacks:
-        return []
-    spans = flight.fallback_spans
-    first = flight.fallen[0]
-    total_s = sum(end - begin for begin, end in spans)
-    modes = [mode.value for mode, _ in groupby(d.mode for d in flight.fallen)]
-    course = f"({', '.join(dict.fromkeys(modes))}) " if len(set(modes)) > 1 else ""
-    times = "once" if s.fallbacks == 1 else f"{s.fallbacks} times"
-    return [
-        f"The fallback {course}took over {times}, for {format_number(total_s)} s in all; "
-        f"{'' if s.fallbacks == 1 else 'first '}at {format_number(spans[0][0])} s: {first.reason}."
-    ]
+def _describe_rest(flight: FlightData) -> list[str]:
+    """Return a sentence on a recording that was recovered, or goes on in another file; none else."""
+    kind = flight.notes[-1].kind if flight.notes else None
+    if kind is NoteKind.RECOVERED:
+        return [f"The recording was {flight.notes[-1].text}."]
+    return ["The flight goes on in the next file."] if kind is NoteKind.CONTINUED else []
 
 
 def _describe_relaxed_plan(flight: FlightData) -> list[str]:

@@ -105,6 +105,7 @@ class Drawing:
     key: str
     svg: str
     label: str
+    kind: str = ""  # "wide broad" takes the width of the page, "wide narrow" stands in for it on phones
 
 
 @dataclass

@@ -67,12 +67,11 @@ class _TimedRecord(Protocol):
     def at_ns(self) -> int: ...
 
 
-def draw_timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...], str]:
-    """Draw the lanes for a wide page and a narrow one; return both, a legend of bars, and what the lanes mean."""
+def draw_timeline(flight: FlightData) -> Iterator[Drawing]:
+    """Draw the lanes twice: for a wide page and for a narrow one."""
     rows = list(make_lanes(flight))
     label = "Timeline of the flight: " + ", ".join(lane.name for lane in rows)
-    drawings = []
-    for key, width_in in (("timeline-wide", WIDE_IN), ("timeline-narrow", WIDTH_IN)):
+    for key, width_in, kind in (("timeline-wide", WIDE_IN, "wide broad"), ("timeline-narrow", WIDTH_IN, "wide narrow")):
         with open_canvas(key, 0.55 + _LANE_IN * len(rows), width_in) as canvas:
             ax = canvas.axes("", "time [s]", "", _LEFT_IN)
             set_time_axis(ax, flight)
@@ -83,9 +82,12 @@ def draw_timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...
             ax.tick_params(axis="y", length=0)
             ax.grid(visible=False, axis="y")
             ax.spines["left"].set_visible(False)  # it would cover marks of the first tick
-        drawings.append(Drawing(key, canvas.svg, label))
-    meanings = "; ".join(f"“{lane.name}”: {lane.meaning}" for lane in rows)
-    return drawings[0], drawings[1], tuple(_list_hidden_texts(rows, flight)), f"What a lane shows: {meanings}."
+        yield Drawing(key, canvas.svg, label, kind)
+
+
+def describe_lanes(flight: FlightData) -> str:
+    """Return a sentence on what each lane shows."""
+    return f"What a lane shows: {'; '.join(f'“{lane.name}”: {lane.meaning}' for lane in make_lanes(flight))}."
 
 
 def _find_silent_steps(flight: FlightData) -> Iterator[Decision]:
@@ -99,12 +101,12 @@ def _find_silent_steps(flight: FlightData) -> Iterator[Decision]:
             arrivals = 0
 
 
-def _list_hidden_texts(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
+def list_hidden_texts(flight: FlightData) -> Iterator[Mark]:
     """Return legend entries for bars that are too short for their text on the narrow page."""
     shown_s = max(flight.duration_s, flight.design.dt_s)
     character_s = _compute_character_s(shown_s, WIDTH_IN)
     texts_by_role: dict[str, dict[str, None]] = {}
-    for bar in (bar for lane in rows for bar in lane.spans):
+    for bar in (bar for lane in make_lanes(flight) for bar in lane.spans):
         if not _fits(bar, character_s):
             texts_by_role.setdefault(bar.role, {})[bar.text] = None
     for role, texts in texts_by_role.items():

@@ -11,18 +11,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from logs.recording.flight import find_spans
 from logs.recording.mavlink_flight import MavlinkFlight, MavlinkFlightInfo, PositionTrack
 from logs.recording.summary import ARRIVED_M, BLIND_S, compute_errors_from_arrival, count
 from logs.report.battery import find_battery_faults
 from logs.report.findings import Finding, Headline, make_headline, metres, seconds, sort_findings
-from logs.report.vehicle_texts import FAILSAFE_MODES, classify_text
+from logs.report.vehicle_texts import FAILSAFE_MODES, classify_texts
 from uavctl.arrays import Array
 from uavctl.cause import BAD, Cause
 from uavctl.mavlink.profile import PROFILES
 from uavctl.number_text import format_number
+from uavctl.records import Severity
 
-_ERROR_SEVERITIES = ("emergency", "alert", "critical", "error")  # of MAV_SEVERITY
-_WARNING_SEVERITIES = (*_ERROR_SEVERITIES, "warning")
+_SEVERITIES = {  # of MAV_SEVERITY; the others are notices
+    **dict.fromkeys(("emergency", "alert", "critical", "error"), Severity.ERROR),
+    "warning": Severity.WARNING,
+}
 _MAX_DISAGREEMENT_M = 0.5  # between its own position and those sent, beyond what their origins differ by
 _MAX_INTERPOLATION_S = 0.5  # between two of its own positions, to tell one in between
 _HEARTBEAT_S = 1.0  # between two heartbeats
@@ -83,15 +87,7 @@ def derive_tlog_headline(flight: MavlinkFlight) -> Headline:
 
 def find_armed_spans(info: MavlinkFlightInfo) -> list[tuple[float, float]]:
     """Return from when to when it was armed [s]."""
-    spans: list[tuple[float, float]] = []
-    since_s: float | None = None
-    for mode in info.modes:
-        if mode.armed and since_s is None:
-            since_s = mode.at_s
-        elif not mode.armed and since_s is not None:
-            spans.append((since_s, mode.at_s))
-            since_s = None
-    return spans if since_s is None else [*spans, (since_s, info.duration_s)]
+    return find_spans(((mode.at_s, mode.armed) for mode in info.modes), info.duration_s)
 
 
 def _make_clear_finding(armed: ArmedFlight) -> Finding:
@@ -114,20 +110,14 @@ def _make_clear_finding(armed: ArmedFlight) -> Finding:
 
 def _find_texts(armed: ArmedFlight) -> Iterator[Finding]:
     """Find what it said that a pilot must know, each cause once."""
-    reported_causes: set[Cause] = set()
-    at_s = np.array([text.at_s for text in armed.info.texts])
-    is_armed = armed.inside(at_s, _HEARTBEAT_S)
-    for text in (text for text, is_inside in zip(armed.info.texts, is_armed, strict=True) if is_inside):
-        cause = classify_text(
-            text.text, is_error=text.severity in _ERROR_SEVERITIES, is_warning=text.severity in _WARNING_SEVERITIES
+    is_armed = armed.inside(np.array([text.at_s for text in armed.info.texts]), _HEARTBEAT_S)
+    texts = [text for text, is_inside in zip(armed.info.texts, is_armed, strict=True) if is_inside]
+    for text, cause in classify_texts(texts, lambda text: _SEVERITIES.get(text.severity, Severity.INFO)):
+        before, after = armed.mode_at(text.at_s - _HEARTBEAT_S), armed.mode_at(text.at_s + 2.0 * _HEARTBEAT_S)
+        mode = f"from {before} to {after}" if before != after else after
+        yield Finding(
+            cause, text.at_s, f'it said "{text.text.strip()}" ({text.severity}) at {seconds(text.at_s)} ({mode})'
         )
-        if cause is not None and cause not in reported_causes:
-            reported_causes.add(cause)
-            before, after = armed.mode_at(text.at_s - _HEARTBEAT_S), armed.mode_at(text.at_s + 2.0 * _HEARTBEAT_S)
-            mode = f"from {before} to {after}" if before != after else after
-            yield Finding(
-                cause, text.at_s, f'it said "{text.text.strip()}" ({text.severity}) at {seconds(text.at_s)} ({mode})'
-            )
 
 
 def _find_battery_fault(armed: ArmedFlight) -> Iterator[Finding]:

@@ -6,23 +6,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from markupsafe import Markup
 
 from logs.recording.design_view import AXIS_NUMBER
 from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, format_rate, list_facts
 from logs.recording.output_files import write_atomically
-from logs.report import page
 from logs.report.figures import thin_keeping_largest
-from logs.report.page import Mark, PageSection
-from logs.report.plots import DISPLAY_AXES, DOTTED, RATE_NAMES, has_variation, thin_path, thin_samples
+from logs.report.page import Mark, Part, Section, render_facts, render_folded, render_list, render_page, render_table
+from logs.report.plots import DISPLAY_AXES, DOTTED, PATH_VIEWS, RATE_NAMES, has_variation, thin_path, thin_samples
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from logs.report.tlog_headline import derive_tlog_headline
 from uavctl.arrays import Array
 
-_OWN = Mark("line", "estimate", "position of the vehicle's own")
-_SENT = Mark("dot", "sample", "position sent to it")
-_SETPOINT = Mark("dotted", "target", "setpoint")
-_EMPTY_TEXT = "There are none."
 _MAX_ROWS = 1000  # of a table on the page; the document of `--json` has all
 
 
@@ -38,14 +32,12 @@ def write_tlog_page(flight: MavlinkFlight, path: Path) -> None:
 def render_tlog_page(flight: MavlinkFlight) -> str:
     """Return the page of a flight as HTML."""
     info = flight.info
-    autopilot = info.autopilot or "no autopilot"
-    headline = derive_tlog_headline(flight)
-    return page.render_page(
+    return render_page(
         f"Flight in {Path(info.recording).name}",
-        f"{info.begin_utc or 'no date'} · {info.duration_s:.1f} s · {autopilot}",
-        (),
-        _make_sections(flight),
-        top=page.render_banner(headline.tone, headline.word, headline.text, headline.reasons),
+        f"{info.begin_utc or 'no date'} · {info.duration_s:.1f} s · {info.autopilot or 'no autopilot'}",
+        SECTIONS,
+        flight,
+        derive_tlog_headline(flight),
     )
 
 
@@ -56,75 +48,56 @@ def describe_recording(info: MavlinkFlightInfo) -> Iterator[str]:
     yield from (f"{note}." for note in info.notes)
 
 
-def _make_sections(flight: MavlinkFlight) -> Iterator[PageSection]:
+def _draw_height(flight: MavlinkFlight) -> Iterator[Part]:
+    yield _draw_values(flight, "height", "Height", "height [m]", flight.height_t_s, flight.height_m)
+
+
+def _draw_battery(flight: MavlinkFlight) -> Iterator[Part]:
+    yield _draw_values(flight, "battery", "Battery", "voltage [V]", flight.battery_t_s, flight.battery_v)
+
+
+def _draw_ages(flight: MavlinkFlight) -> Iterator[Part]:
+    known = [(source, ages) for source, ages in flight.ages.items() if len(ages.age_s)]
+    return (_draw_age(flight, f"age-{number}", source, ages) for number, (source, ages) in enumerate(known))
+
+
+def _show_modes(flight: MavlinkFlight) -> Iterator[Part]:
+    rows = [(f"{mode.at_s:.2f}", mode.mode, "armed" if mode.armed else "") for mode in flight.info.modes]
+    return _make_table(("from [s]", "mode", "armed"), rows)
+
+
+def _show_texts(flight: MavlinkFlight) -> Iterator[Part]:
+    rows = [(f"{text.at_s:.2f}", text.severity, text.text) for text in flight.info.texts]
+    return _make_table(("at [s]", "severity", "text"), rows)
+
+
+def _show_contents(flight: MavlinkFlight) -> Iterator[Part]:
     info = flight.info
-    marks = (*((_OWN,) if len(flight.own.t_s) else ()), *((_SENT,) if flight.sent else ()))
-    if marks:
-        yield PageSection("Path", "", page.render_grid(list(_draw_paths(flight))), marks)
-        has_setpoints = np.isfinite(flight.setpoint_m).any() or np.isfinite(flight.setpoint_mps).any()
-        wanted = (_SETPOINT,) if has_setpoints else ()
-        note = "Time counts from the recording's begin. All is in local NED, height upwards."
-        yield PageSection("Axes over time", note, page.render_grid(list(_draw_axes(flight))), (*marks, *wanted))
-    elif has_variation(flight.height_m):
-        height = _draw_values(flight, "height", "Height", "height [m]", flight.height_t_s, flight.height_m)
-        yield PageSection("Height", "It told no place, and its height alone.", page.render_grid([height]))
-    if has_variation(flight.battery_v):
-        battery = _draw_values(flight, "battery", "Battery", "voltage [V]", flight.battery_t_s, flight.battery_v)
-        yield PageSection("Battery", "", page.render_grid([battery]))
-    if len(flight.attitude_t_s):
-        yield PageSection("Attitude", "", page.render_grid(list(_draw_attitude(flight))))
-    ages_by_source = {source: ages for source, ages in flight.ages.items() if len(ages.age_s)}
-    if ages_by_source:
-        note = (
-            "The age of the newest position grows until another one arrives. Its source's clock is not known: ages are "
-            "those beyond the quickest position of the last ten seconds."
-        )
-        drawings = [
-            _draw_age(flight, f"age-{number}", *source_ages)
-            for number, source_ages in enumerate(ages_by_source.items())
-        ]
-        yield PageSection("Age of positions", note, page.render_grid(drawings))
-    if info.setpoints:
-        drawings = list(_draw_setpoints(flight))
-        body = (
-            page.render_grid(drawings)
-            if drawings
-            else page.render_paragraph("They ask for no acceleration that changes.")
-        )
-        yield PageSection("Acceleration setpoints", "", body)
-    modes = [(f"{mode.at_s:.2f}", mode.mode, "armed" if mode.armed else "") for mode in info.modes]
-    yield PageSection("Modes", "", _make_table(("from [s]", "mode", "armed"), modes))
-    texts = [(f"{text.at_s:.2f}", text.severity, text.text) for text in info.texts]
-    if texts:
-        yield PageSection("Texts of the vehicle", "", _make_table(("at [s]", "severity", "text"), texts))
     messages = [(name, str(number), format_rate(info, name)) for name, number in info.messages.items()]
+    yield render_folded("Messages", render_table(("message", "number", "rate"), messages, frozenset({1, 2})))
     parameters = [(name, str(parameter.value), parameter.type) for name, parameter in info.parameters.items()]
-    folded = page.render_folded(
-        "Messages", page.render_table(("message", "number", "rate"), messages, frozenset({1, 2}))
-    )
     if parameters:
-        columns = ("parameter", "value", "type")
-        folded += page.render_folded(
-            "Parameters of the vehicle", page.render_table(columns, parameters, frozenset({1}))
-        )
-    yield PageSection("What is in it", "", folded)
-    yield PageSection("Summary", "", page.render_list(describe_recording(info)) + page.render_facts(list_facts(info)))
+        table = render_table(("parameter", "value", "type"), parameters, frozenset({1}))
+        yield render_folded("Parameters of the vehicle", table)
 
 
-def _make_table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Markup:
+def _show_summary(flight: MavlinkFlight) -> Iterator[Part]:
+    yield render_list(describe_recording(flight.info))
+    yield render_facts(list_facts(flight.info))
+
+
+def _has_place(flight: MavlinkFlight) -> bool:
+    return bool(len(flight.own.t_s) or flight.sent)
+
+
+def _make_table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Iterator[Part]:
     more = [f"{len(rows) - _MAX_ROWS} more are in the document of --json"] if len(rows) > _MAX_ROWS else []
-    return (
-        page.render_table(columns, rows[:_MAX_ROWS], frozenset({0}), more)
-        if rows
-        else page.render_paragraph(_EMPTY_TEXT)
-    )
+    if rows:
+        yield render_table(columns, rows[:_MAX_ROWS], frozenset({0}), more)
 
 
 def _draw_paths(flight: MavlinkFlight) -> Iterator[Drawing]:
-    for key, title, axes_shown in (
-        ("path-above", "From above", ("east", "north")),
-        ("path-side", "From the south", ("east", "down")),
-    ):
+    for key, title, axes_shown in PATH_VIEWS:
         columns = [AXIS_NUMBER[axis] for axis in axes_shown]
         tracks = (flight.own.position_m, *(track.position_m for track in flight.sent.values()))
         if not any(has_variation(track[:, number]) for track in tracks for number in columns):
@@ -228,3 +201,49 @@ def _draw_setpoints(flight: MavlinkFlight) -> Iterator[Drawing]:
             ax.step(*thin_samples(flight.setpoint_t_s, values), where="post", color=colour("estimate"), lw=1.1)
             ax.set_xlim(0, max(flight.duration_s, 1e-3))
         yield Drawing(key, canvas.svg, f"Acceleration setpoint {upwards} over time")
+
+
+_MARKS = (
+    Mark("line", "estimate", "position of the vehicle's own", when=lambda flight: len(flight.own.t_s)),
+    Mark("dot", "sample", "position sent to it", when=lambda flight: flight.sent),
+)
+_SETPOINT = Mark(
+    "dotted",
+    "target",
+    "setpoint",
+    when=lambda flight: np.isfinite(flight.setpoint_m).any() or np.isfinite(flight.setpoint_mps).any(),
+)
+SECTIONS: tuple[Section[MavlinkFlight], ...] = (
+    Section("Path", _draw_paths, when=_has_place, legend=_MARKS),
+    Section(
+        "Axes over time",
+        _draw_axes,
+        when=_has_place,
+        note="Time counts from the recording's begin. All is in local NED, height upwards.",
+        legend=(*_MARKS, _SETPOINT),
+    ),
+    Section(
+        "Height",
+        _draw_height,
+        when=lambda flight: not _has_place(flight) and has_variation(flight.height_m),
+        note="It told no place, and its height alone.",
+    ),
+    Section("Battery", _draw_battery, when=lambda flight: has_variation(flight.battery_v)),
+    Section("Attitude", _draw_attitude),
+    Section(
+        "Age of positions",
+        _draw_ages,
+        note="The age of the newest position grows until another one arrives. Its source's clock is not known: ages "
+        "are those beyond the quickest position of the last ten seconds.",
+    ),
+    Section(
+        "Acceleration setpoints",
+        _draw_setpoints,
+        when=lambda flight: flight.info.setpoints,
+        otherwise="They ask for no acceleration that changes.",
+    ),
+    Section("Modes", _show_modes, otherwise="There are none."),
+    Section("Texts of the vehicle", _show_texts),
+    Section("What is in it", _show_contents),
+    Section("Summary", _show_summary),
+)

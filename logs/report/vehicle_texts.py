@@ -7,8 +7,11 @@ the radio as a warning. So some words count at every severity, others from a war
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol, TypeVar
 
 from uavctl.cause import Cause
+from uavctl.records import Severity
 
 _RESOLVED = re.compile(r"\b(cleared?|enabled?|disabled?|deactivated|recovered|indexed|loaded)\b", re.IGNORECASE)
 _PREFLIGHT = re.compile(r"^(pre-?arm|arm|arming denied|preflight fail)\b", re.IGNORECASE)
@@ -27,16 +30,34 @@ FAILSAFE_MODES = frozenset({"AUTO.20", "AUTO.DESCEND", "DESCEND", "TERMINATION",
 _AT_ANY_SEVERITY = frozenset({Cause.VEHICLE_FENCE, Cause.VEHICLE_FAILSAFE})
 
 
-def classify_text(text: str, *, is_error: bool, is_warning: bool) -> Cause | None:
-    """Return the cause that a text of an armed vehicle tells of; None if it tells of none.
+class _Text(Protocol):
+    @property
+    def text(self) -> str: ...
+
+
+T = TypeVar("T", bound=_Text)
+
+
+def classify_texts(texts: Iterable[T], get_severity: Callable[[T], Severity]) -> Iterator[tuple[T, Cause]]:
+    """Return the first text of each cause that an armed vehicle's texts tell of.
 
     Args:
-        grave: Whether its severity is critical or worse.
-        warns: Whether it is at least that of a warning.
+        texts: Its texts, in their order.
+        get_severity: Returns that of a text; critical and worse is an error.
     """
+    found: set[Cause] = set()
+    for text in texts:
+        cause = classify_text(text.text, get_severity(text))
+        if cause is not None and cause not in found:
+            found.add(cause)
+            yield text, cause
+
+
+def classify_text(text: str, severity: Severity) -> Cause | None:
+    """Return the cause that a text of an armed vehicle tells of; None if it tells of none."""
     if _PREFLIGHT.search(text):
         return None
     cause = next((candidate for pattern, candidate in _PATTERNS if pattern.search(text)), None)
-    if cause is not None and (is_warning or cause in _AT_ANY_SEVERITY):
+    if cause is not None and (severity is not Severity.INFO or cause in _AT_ANY_SEVERITY):
         return None if _RESOLVED.search(text) else cause
-    return Cause.VEHICLE_ALARM if is_error else Cause.VEHICLE_WARNED if is_warning else None
+    return {Severity.ERROR: Cause.VEHICLE_ALARM, Severity.WARNING: Cause.VEHICLE_WARNED}.get(severity)

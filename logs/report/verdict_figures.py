@@ -21,20 +21,24 @@ _MARGIN = 1.25
 
 def draw_whiteness(axis: AxisVerdict) -> Drawing:
     """Draw the autocorrelation of an axis' one-step errors."""
-    lags = np.arange(1, len(axis.correlation) + 1, dtype=np.float64)
-    values = np.array(axis.correlation)
-    with open_canvas(f"white-{axis.axis}", 2.3) as canvas:
-        ax = canvas.axes(f"Whiteness, {axis.axis}", "positions apart", "correlation of errors")
-        ax.axhspan(-axis.correlation_bound, axis.correlation_bound, color=colour("target"), alpha=0.15, lw=0)
+    label = f"Correlation of the forecast's errors {axis.axis} with those of later positions; white within the band"
+    return draw_correlation(axis.axis, np.array(axis.correlation), axis.correlation_bound, label)
+
+
+def draw_correlation(axis: str, correlation: Array, bound: float, label: str) -> Drawing:
+    """Draw the autocorrelation of the errors of an axis at 1, 2, … positions apart, with a band for white ones."""
+    lags = np.arange(1, len(correlation) + 1, dtype=np.float64)
+    with open_canvas(f"white-{axis}", 2.3) as canvas:
+        ax = canvas.axes(f"Whiteness, {axis}", "positions apart", "correlation of errors")
+        ax.axhspan(-bound, bound, color=colour("target"), alpha=0.15, lw=0)
         ax.axhline(0.0, color=colour("muted"), lw=0.8)
-        draw_strokes(ax, (lags, np.zeros(len(lags))), (lags, values), colour("estimate"), 2.4)
-        draw_dots(ax, lags, values, "estimate", 5.0)
-        reach = max(0.3, _MARGIN * float(np.abs(values).max()), _MARGIN * axis.correlation_bound)
+        draw_strokes(ax, (lags, np.zeros(len(lags))), (lags, correlation), colour("estimate"), 2.4)
+        draw_dots(ax, lags, correlation, "estimate", 5.0)
+        reach = max(0.3, _MARGIN * float(np.abs(correlation).max()), _MARGIN * bound)
         ax.set_ylim(-reach, reach)
         ax.set_xlim(0.0, len(lags) + 1.0)
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    label = f"Correlation of the forecast's errors {axis.axis} with those of later positions; white within the band"
-    return Drawing(f"white-{axis.axis}", canvas.svg, label)
+    return Drawing(f"white-{axis}", canvas.svg, label)
 
 
 def draw_coverage(leads: tuple[LeadVerdict, ...]) -> Drawing:

@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import (
@@ -24,10 +23,9 @@ from logs.recording.summary import (
     find_state_violations,
 )
 from logs.report.statistics import LEVEL, Share, binomial_p_value, estimate_share
+from uavctl.arrays import Flags
 from uavctl.config import Config
 from uavctl.records import ControlMode
-
-Flags = NDArray[np.bool_]
 
 
 class LimitRisk(msgspec.Struct, frozen=True, kw_only=True):

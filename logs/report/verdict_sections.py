@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from logs.recording.flight import FlightData
-from logs.report import page, verdict_figures
-from logs.report.page import Mark, PageSection
+from collections.abc import Iterator
+
+from logs.report import verdict_figures
+from logs.report.evidence import FlightEvidence
+from logs.report.page import Mark, Part, Section, render_folded, render_note, render_table
 from logs.report.statistics import LEVEL
 from logs.report.verdict_clocks import ClockVerdict, format_plain
-from logs.report.verdict_model import AxisVerdict, ModelOutcome, ModelVerdict
+from logs.report.verdict_model import AxisVerdict, LeadVerdict, ModelOutcome, ModelVerdict
 from logs.report.verdict_risk import LimitRisk
-from logs.report.verdicts import Judgement, Verdicts
+from logs.report.verdicts import Verdicts
 
-_PREDICTED = Mark("line", "estimate", "measured")
-_BAND = Mark("band", "target", f"where a right model stays with {100 * LEVEL:.0f} %")
 _UNREADABLE = "The flight's configuration cannot be read by this version, so its model cannot be run again."
 
 
@@ -55,32 +55,21 @@ def _describe_departure(model: ModelVerdict) -> str:
     return f": errors were {', '.join(tests)}" if tests else ""
 
 
-def make_risk_section(verdicts: Verdicts) -> PageSection:
-    """Make the section on the promised and the measured risk."""
-    risk = verdicts.risk
+def _show_risk(e: FlightEvidence) -> Iterator[Part]:
+    """Return the promised and the measured risk of each limit; limits of single states that were kept are counted."""
+    risk = e.judged.verdicts.risk
     limits = [limit for index, limit in enumerate(risk.limits) if index < 2 or limit.outside]
     hidden_count = len(risk.limits) - len(limits)
     columns = ("limit", "outside", "with news", "risk up to", "promised")
-    body = [
-        page.render_paragraph(risk.text),
-        page.render_table(columns, [_make_risk_row(limit) for limit in limits], frozenset({1, 2, 3, 4})),
-    ]
+    yield risk.text
+    yield render_table(columns, map(_make_risk_row, limits), frozenset({1, 2, 3, 4}))
     if hidden_count:
-        body.append(page.render_note(f"The other {hidden_count} limits of single states were never broken."))
+        yield render_note(f"The other {hidden_count} limits of single states were never broken.")
     if risk.unpromised:
-        body.append(
-            page.render_note(
-                f"{risk.unpromised} of {risk.limits[0].steps} flown steps had no promise: it takes a plan that was "
-                "flown in the step before, and in which no constraint gave way."
-            )
+        yield render_note(
+            f"{risk.unpromised} of {risk.limits[0].steps} flown steps had no promise: it takes a plan that was "
+            "flown in the step before, and in which no constraint gave way."
         )
-    note = (
-        "“outside” counts all flown steps; “with news” those at which a position had just come, which are independent "
-        f"as far as the promise goes. “risk up to” is the upper end of the exact {100 * LEVEL:.0f} % interval "
-        "(Clopper and Pearson), all limits together. A promise holds for all limits of the states, or of the inputs, "
-        "at once."
-    )
-    return PageSection("Verdict: promised risk against measured", note, page.join(body))
 
 
 def _make_risk_row(risk: LimitRisk) -> tuple[str, ...]:
@@ -93,54 +82,33 @@ def _make_risk_row(risk: LimitRisk) -> tuple[str, ...]:
     )
 
 
-def make_model_section(flight: FlightData, judged: Judgement) -> PageSection:
-    """Make the section on the model: errors of its forecasts, and their tests."""
-    title = "Verdict: the model against what was flown"
-    verdict, samples = judged.verdicts.model, judged.innovations
+def _show_model(e: FlightEvidence) -> Iterator[Part]:
+    """Return the verdict on the model, its tests by axis, and its figures."""
+    verdict, samples = e.judged.verdicts.model, e.judged.innovations
     if verdict is None or samples is None:
-        return PageSection(title, "", page.render_paragraph(_UNREADABLE))
-    drawings = [
-        *(
-            drawing
-            for column, axis in enumerate(verdict.axes)
-            for drawing in (
-                verdict_figures.draw_errors(flight, axis.axis, samples.t_s, samples.normalised[:, column]),
-                verdict_figures.draw_whiteness(axis),
-            )
-        ),
-        *([verdict_figures.draw_coverage(verdict.leads)] if verdict.leads else ()),
-    ]
-    columns = ("axis", "error [mm]", "× predicted", "bounds", "mean", "white")
-    table = page.render_table(
-        columns, [_make_axis_row(axis_verdict) for axis_verdict in verdict.axes], frozenset({1, 2, 3, 4, 5})
-    )
-    body = [page.render_paragraph(verdict.text)]
+        yield _UNREADABLE
+        return
+    yield verdict.text
     if verdict.axes:
-        body.append(table)
-    if drawings:
-        body.append(page.render_grid(drawings))
+        columns = ("axis", "error [mm]", "× predicted", "bounds", "mean", "white")
+        yield render_table(columns, map(_make_axis_row, verdict.axes), frozenset({1, 2, 3, 4, 5}))
+    for column, axis in enumerate(verdict.axes):
+        yield verdict_figures.draw_errors(e.flight, axis.axis, samples.t_s, samples.normalised[:, column])
+        yield verdict_figures.draw_whiteness(axis)
     if verdict.leads:
-        columns_ahead = ("time ahead", "in the ellipsoid", "share", "interval")
-        rows = [
-            (
-                f"{lead.lead_s:.3g} s",
-                f"{lead.inside.hits} of {lead.inside.trials}",
-                f"{_format_percent(lead.inside.rate)}{_mark(lead.has_too_few_inside, lead.refuted)}",
-                f"{100 * lead.inside.low:.3g} … {100 * lead.inside.high:.3g} %",
-            )
-            for lead in verdict.leads
-        ]
-        body.append(
-            page.render_folded("Ellipsoids in figures", page.render_table(columns_ahead, rows, frozenset({0, 1, 2, 3})))
-        )
-    note = (
-        "The flight's filter is run again over all positions it used, in the order of capture. An error is a position "
-        "minus what those before it predict; if the model is right, errors are as large as predicted (1 ×), zero on "
-        "average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is predicted for "
-        "the inputs that were then flown. ✗ refutes the model; ○ departs from it on the cautious side."
+        yield verdict_figures.draw_coverage(verdict.leads)
+        lead_columns = ("time ahead", "in the ellipsoid", "share", "interval")
+        table = render_table(lead_columns, map(_make_lead_row, verdict.leads), frozenset({0, 1, 2, 3}))
+        yield render_folded("Ellipsoids in figures", table)
+
+
+def _make_lead_row(lead: LeadVerdict) -> tuple[str, ...]:
+    return (
+        f"{lead.lead_s:.3g} s",
+        f"{lead.inside.hits} of {lead.inside.trials}",
+        f"{_format_percent(lead.inside.rate)}{_mark(lead.has_too_few_inside, lead.refuted)}",
+        f"{100 * lead.inside.low:.3g} … {100 * lead.inside.high:.3g} %",
     )
-    legend = (_PREDICTED, _BAND, Mark("dashed", "limit", "promised")) if drawings else ()
-    return PageSection(title, note, page.join(body), legend)
 
 
 def _make_axis_row(verdict: AxisVerdict) -> tuple[str, ...]:
@@ -158,24 +126,16 @@ def _mark(is_refuted: bool, is_cautious: bool = False) -> str:
     return " ✗" if is_refuted else " ○" if is_cautious else ""
 
 
-def make_clocks_section(flight: FlightData, verdicts: Verdicts) -> PageSection:
-    """Make the section on the clocks of all connections."""
-    note = "The age of information is only as true as the times of capture, which come from the clocks of others."
-    sentences = [clock.text for clock in verdicts.clocks]
+def _show_clocks(e: FlightEvidence) -> Iterator[Part]:
+    """Return the verdicts on the clocks of all connections, and on the stamps."""
+    verdicts = e.judged.verdicts
+    yield from (clock.text for clock in verdicts.clocks)
     if verdicts.stamps is not None:
-        sentences.append(verdicts.stamps.text)
-    if not sentences:
-        return PageSection("Verdict: clocks", note, page.render_paragraph("No connection told anything of its clock."))
-    drawings = list(verdict_figures.draw_clocks(flight, verdicts.clocks))
-    body = [page.render_paragraph(sentence) for sentence in sentences]
-    columns = ("connection", "source", "drift [ppm]", "residual [µs]", "round trip [ms]", "refused")
+        yield verdicts.stamps.text
     if verdicts.clocks:
-        body.append(
-            page.render_table(columns, [_make_clock_row(clock) for clock in verdicts.clocks], frozenset({2, 3, 4, 5}))
-        )
-    if drawings:
-        body.append(page.render_grid(drawings))
-    return PageSection("Verdict: clocks", note, page.join(body))
+        columns = ("connection", "source", "drift [ppm]", "residual [µs]", "round trip [ms]", "refused")
+        yield render_table(columns, map(_make_clock_row, verdicts.clocks), frozenset({2, 3, 4, 5}))
+    yield from verdict_figures.draw_clocks(e.flight, verdicts.clocks)
 
 
 def _make_clock_row(verdict: ClockVerdict) -> tuple[str, ...]:
@@ -198,3 +158,37 @@ def _format_percent(share: float) -> str:
 
 def _format_p_value(value: float) -> str:
     return f"{value:.2g}" if value >= 1e-4 else "< 0.0001"
+
+
+SECTIONS: tuple[Section[FlightEvidence], ...] = (
+    Section(
+        "Verdict: promised risk against measured",
+        _show_risk,
+        note="“outside” counts all flown steps; “with news” those at which a position had just come, which are "
+        f"independent as far as the promise goes. “risk up to” is the upper end of the exact {100 * LEVEL:.0f} % "
+        "interval (Clopper and Pearson), all limits together. A promise holds for all limits of the states, or of the "
+        "inputs, at once.",
+        is_closed=True,
+    ),
+    Section(
+        "Verdict: the model against what was flown",
+        _show_model,
+        note="The flight's filter is run again over all positions it used, in the order of capture. An error is a "
+        "position minus what those before it predict; if the model is right, errors are as large as predicted (1 ×), "
+        "zero on average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is "
+        "predicted for the inputs that were then flown. ✗ refutes the model; ○ departs from it on the cautious side.",
+        legend=(
+            Mark("line", "estimate", "measured"),
+            Mark("band", "target", f"where a right model stays with {100 * LEVEL:.0f} %"),
+            Mark("dashed", "limit", "promised"),
+        ),
+        is_closed=True,
+    ),
+    Section(
+        "Verdict: clocks",
+        _show_clocks,
+        note="The age of information is only as true as the times of capture, which come from the clocks of others.",
+        otherwise="No connection told anything of its clock.",
+        is_closed=True,
+    ),
+)

@@ -26,6 +26,7 @@ from text_numbers import find_numbers
 
 from logs.recording.replay import replay
 from logs.recording.summary import compute_box, compute_position_errors_m, list_summary_rows, summarise
+from logs.report.evidence import FlightEvidence
 from logs.report.flight_page import render_report
 from logs.report.headline import derive_headline
 from logs.report.summary_text import describe_flight
@@ -234,7 +235,10 @@ def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
     beyond = fenced.steps.state[:, 0] - 1.0
     summary = summarise(fenced, wall_s=1.0)
     assert summary.state_violations == np.count_nonzero(beyond > 0) > 5
-    assert derive_headline(fenced, summary, judge_flight(fenced)).cause in (Cause.BEYOND_LIMIT, Cause.LEFT_LIMITS)
+    assert derive_headline(FlightEvidence(fenced, summary, judge_flight(fenced))).cause in (
+        Cause.BEYOND_LIMIT,
+        Cause.LEFT_LIMITS,
+    )
 
 
 def test_time_counts_from_the_first_decision_with_a_vehicle_that_takes_setpoints() -> None:

@@ -28,9 +28,9 @@ from flight_rig import (
     vehicle,
 )
 from msgspec import structs
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
 from uavctl.event_codes import EventCode
@@ -43,8 +43,6 @@ from uavctl.records import ControlMode, PositionSample, StepInput, VehicleMotion
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.estimate import add_bias, innovation_form
 from uavctl.wiring.controller import build_controller, build_design, build_spec
-
-Array = NDArray[np.float64]
 
 DRIFT, MOST = 0.03, 0.4
 

@@ -20,9 +20,9 @@ from flight_rig import (
     small_plant,
 )
 from msgspec.structs import replace as changed
-from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
+from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import (
     FilterHistory,
@@ -51,7 +51,6 @@ from uavctl.flight.propagation import make_propagation
 from uavctl.records import Estimate, PositionSample
 from uavctl.smpc.plant import Plant
 
-Array = NDArray[np.float64]
 S = 1_000_000_000
 
 

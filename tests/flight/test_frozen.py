@@ -23,15 +23,14 @@ from flight_rig import (
     small_plant,
     vehicle,
 )
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, StepInput, Vec3, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
-Array = NDArray[np.float64]
 Camera = Callable[[int, Vec3], Vec3]  # tick, truth -> what it says
 
 TRACK = ControlMode.TRACK

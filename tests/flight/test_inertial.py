@@ -28,9 +28,9 @@ from flight_rig import (
     stub_inputs,
     vehicle,
 )
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.event_codes import EventCode
 from uavctl.flight.act import find_return_accel
@@ -68,8 +68,6 @@ from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
 from uavctl.wiring.controller import build_estimator, build_plant
-
-Array = NDArray[np.float64]
 
 DRAG, LAG = 0.3, 0.25
 WIND, DRIFT, MOST = 0.15, 0.2, 0.4

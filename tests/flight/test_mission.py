@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flight_rig import make_rest_region, small_plant
-from numpy.typing import NDArray
 
 from uavctl.config import load_config
 from uavctl.config.types import Config
@@ -34,8 +33,6 @@ from uavctl.records import GaveWay, Vec3
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.wiring.controller import build_controller, build_design
 from uavctl.wiring.mission import build_mission, build_reference_limits, build_trajectory
-
-Array = NDArray[np.float64]
 
 DT_NS = 200_000_000
 SECOND_NS = 1_000_000_000

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.flight.solve import ask_solver
 from uavctl.records import Estimate, SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
-Array = NDArray[np.float64]
 H, N_X, N_U = 5, 4, 2
 
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.config import Config, load_config
 from uavctl.flight.mission import MissionState, find_target, make_question
 from uavctl.flight.trajectory import follow_positions, plan_along
 from uavctl.wiring.controller import build_controller, build_plant
-
-Array = NDArray[np.float64]
 
 LENGTH_S, TURN_S, RADIUS_M = 12.0, 6.0, 0.7
 PRESETS = ("room-px4", "room-ardupilot")

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -21,9 +20,8 @@ from sim.vehicle.rigid_body import (
     reduce_tilt,
     rotate_attitude,
 )
+from uavctl.arrays import Array
 from uavctl.records import Vec3
-
-Array = NDArray[np.float64]
 
 H = 0.0025
 ZERO: Vec3 = (0.0, 0.0, 0.0)

@@ -7,13 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadrotor_rig import WITH_SIH_DRAG, Record, fitted, quadrotor, run
 
 from sim.vehicle.quadrotor import Quadrotor
+from uavctl.arrays import Array
 from uavctl.records import Vec3
-
-Array = NDArray[np.float64]
 
 ARDUPILOT, PX4 = Record.of("arducopter"), Record.of("px4")
 WINDOWS = {"ardupilot": ((55.4, 71.4), (71.4, 87.4)), "px4": ((27.8, 44.2), (43.6, 60.0))}

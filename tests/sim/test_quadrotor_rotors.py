@@ -5,14 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
 from sim.vehicle.battery import BatteryModel
 from sim.vehicle.rotors import STOPPED, Rotors
+from uavctl.arrays import Array
 from uavctl.records import Vec3
-
-Array = NDArray[np.float64]
 
 H = 0.0025
 FAST = 3000.0

@@ -5,16 +5,15 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from sim.vehicle.linear import MAX_ACCEL_MPS2, LinearVehicle, make_linear_model
+from uavctl.arrays import Array
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
 
 S = 1_000_000_000
-Array = NDArray[np.float64]
 DRAGGED = [
     "plant.drag_1ps=[0.3,0.3,0.3]",
     "plant.lag_s=[0.25,0.25,0.25]",

@@ -4,14 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 
 from sim.wind import CALM, FOOT_M, Wind, _LateralGust, compute_dryden
+from uavctl.arrays import Array
 from uavctl.records import Vec3
-
-Array = NDArray[np.float64]
 
 NORTH_WIND: Vec3 = (20.0, 0.0, 0.0)
 STEP_S = 0.1

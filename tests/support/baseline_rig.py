@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 from design_rig import spec
-from numpy.typing import NDArray
 from plant_cases import NAMED, spec_of
 
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Counts
 from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.smpc.baselines import HoldLast, Lqg, PacketisedPredictive, WorstCaseDelay, ZeroOnLoss
 from uavctl.smpc.batch import BatchController, Information
@@ -20,7 +19,6 @@ from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.pid import CascadedPid, PidGains
 from uavctl.smpc.sets import Polytope
 
-Counts = NDArray[np.intp]
 PAPER_START = np.array([35.0, -2.0, -20.0, -4.0])
 
 

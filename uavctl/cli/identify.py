@@ -11,7 +11,6 @@ from typing import Annotated
 import msgspec
 from cyclopts import Parameter
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from logs.recording.file_kind import FileKind, detect_kind
@@ -19,7 +18,7 @@ from logs.recording.output_files import refuse_recording_path, write_atomically
 from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
-from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_progress, warn
+from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_pair_table, make_progress, make_table, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse_recorded
 from uavctl.errors import DesignError, UsageError
@@ -110,38 +109,46 @@ def show_fit_progress(steps: int) -> Iterator[Callable[[], None]]:
 
 def _render(identification: Identification, target: Path, page: Path) -> RenderableType:
     result = identification.result
-    plant = Table(title=f"{result.flown_s:.0f} s flown under setpoints, {result.positions} positions")
-    for column in ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "residual [mm]", "R²"):
-        plant.add_column(column, justify="left" if column == "axis" else "right")
-    for axis in result.response:
-        plant.add_row(
-            axis.axis,
-            f"{axis.lag_s:.3f}",
-            f"{axis.drag_1ps:.3f}",
-            "–" if axis.gain is None else f"{axis.gain:.3f}",
-            f"{axis.wind_std_mps2:.3f}",
-            f"{1e3 * axis.residual_std_m:.1f}",
-            f"{axis.r2:.3f}",
-        )
-    kinds = Table(title="dead time, and error on the halves not fitted to")
-    for column in ("plant", "dead time [s]", "range [s]", "error [mm]"):
-        kinds.add_column(column, justify="left" if column == "plant" else "right")
-    for kind in result.candidates:
-        low_s, high_s = kind.dead_time_range_s
-        range_text = f"{low_s:.2f} to {high_s:.2f}"
-        kinds.add_row(kind.model, f"{kind.dead_time_s:.2f}", range_text, f"{1e3 * kind.error_m:.1f}")
+    plant = make_table(
+        f"{result.flown_s:.0f} s flown under setpoints, {result.positions} positions",
+        ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "residual [mm]", "R²"),
+        (
+            (
+                axis.axis,
+                f"{axis.lag_s:.3f}",
+                f"{axis.drag_1ps:.3f}",
+                "–" if axis.gain is None else f"{axis.gain:.3f}",
+                f"{axis.wind_std_mps2:.3f}",
+                f"{1e3 * axis.residual_std_m:.1f}",
+                f"{axis.r2:.3f}",
+            )
+            for axis in result.response
+        ),
+    )
+    kinds = make_table(
+        "dead time, and error on the halves not fitted to",
+        ("plant", "dead time [s]", "range [s]", "error [mm]"),
+        (
+            (
+                kind.model,
+                f"{kind.dead_time_s:.2f}",
+                " to ".join(f"{end_s:.2f}" for end_s in kind.dead_time_range_s),
+                f"{1e3 * kind.error_m:.1f}",
+            )
+            for kind in result.candidates
+        ),
+    )
     dead_ms, ramp_ms = 1e3 * identification.config.plant.dead_time_s, 1e3 * result.ramp_s
     ramp = f"configured dead time: {dead_ms:.1f} ms, of which {ramp_ms:.1f} ms are half of a setpoint's own ramp"
-    link = Table(title="link", show_header=False)
-    for name, value in (
-        ("rate", f"{identification.link.rate_hz:.4g} Hz"),
-        ("lost", describe_loss(identification.link)),
-        (
-            "delay",
-            f"{1e3 * identification.link.delay_s:.0f} ms, 99 % within {1e3 * identification.link.jitter_s:.0f} ms more",
-        ),
-    ):
-        link.add_row(name, value)
+    delay_ms, jitter_ms = 1e3 * identification.link.delay_s, 1e3 * identification.link.jitter_s
+    link = make_pair_table(
+        "link",
+        [
+            ("rate", f"{identification.link.rate_hz:.4g} Hz"),
+            ("lost", describe_loss(identification.link)),
+            ("delay", f"{delay_ms:.0f} ms, 99 % within {jitter_ms:.0f} ms more"),
+        ],
+    )
     warning_lines = [Text(text, style="yellow") for text in result.warnings]
     ramps = [ramp] if result.ramp_s > 0.0 else []
     return Group(plant, kinds, *ramps, link, *warning_lines, f"configuration: {target}", f"page: {page}")

@@ -19,8 +19,7 @@ from logs.recording.export import Exported, TableFormat, Watch, export_tables
 from logs.recording.file_kind import FileKind, detect_kind
 from logs.recording.file_scan import RecordedMessage
 from logs.recording.foreign import read_foreign_flight
-from logs.recording.info import PositionLoss, RecordingInfo
-from logs.recording.info import read_info as read_info
+from logs.recording.info import PositionLoss, RecordingInfo, read_info
 from logs.recording.mavlink_flight import MavlinkFlightInfo, format_rate, list_facts
 from logs.recording.parameters import VehicleParameter, count_parameters
 from logs.recording.reader import explain_missing_end

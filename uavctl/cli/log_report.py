@@ -32,6 +32,7 @@ from logs.report.compare_text import (
     format_parameter,
     format_value,
 )
+from logs.report.evidence import FlightEvidence
 from logs.report.figures import draw_overview
 from logs.report.findings import Headline
 from logs.report.flight_page import write_report
@@ -82,7 +83,8 @@ def compare_command(
 def render_terminal_comparison(comparison: FlightComparison) -> RenderableType:
     """Return the comparison for a terminal: flights, their agreement, parameters, figures, notes."""
     parts: list[RenderableType] = [_render_sides(comparison.recordings)]
-    parts += [Text(text) for text in map(describe_match, comparison.likenesses)]
+    first = comparison.recordings[0].name
+    parts += [Text(describe_match(match, first)) for match in comparison.likenesses]
     parts.append(_make_parameter_table(comparison) if comparison.parameters else Text("No parameter differs."))
     parts.append(_make_figure_table(comparison))
     parts += [Text(f"Mind: {text}.", style="yellow") for text in comparison.notes]
@@ -152,7 +154,7 @@ def report(
     write_report(data, summary, page, verdicts)
     if cut := explain_missing_end(flight):
         warn(f"{cut}: shown up to there")
-    headline = derive_headline(data, summary, verdicts)
+    headline = derive_headline(FlightEvidence(data, summary, verdicts))
     document = {**msgspec.structs.asdict(summary), "verdicts": verdicts.verdicts, "headline": headline.document()}
     Common(json=json).show(
         "log/report",

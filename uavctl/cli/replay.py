@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +14,7 @@ from logs.recording.summary import count
 from logs.recording.tlog import TlogPacket, replay_tlog
 from uavctl.cli.common import DEFAULTS, Common, Flight, System, locate_design_errors, warn
 from uavctl.cli.replay_table import make_foreign_table, make_replay_table
-from uavctl.cli.replays import read_foreign_vehicle, replay_flight
+from uavctl.cli.replays import ReplayOutcome, read_foreign_vehicle, replay_flight
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
@@ -46,17 +47,9 @@ def replay(
             "configuration, of which --set changes a key"
         )
     replayed = replay_flight(flight, tolerance, common.overrides)
-    result = replayed.result
-    for text in replayed.other_versions:
-        warn(f"{text}: decisions may differ")
-    if result.dropped:
-        text = f"{count(result.dropped, 'record')} missing in the recording: what came after cannot be compared"
+    for text in _list_warnings(replayed):
         warn(text)
-    if replayed.holes:
-        warn(f"{replayed.holes}: where messages are missing, what came after cannot be compared")
-    if replayed.lacks_end:
-        compared = "compared up to there" if result.decisions else "before its first decision, so nothing was compared"
-        warn(f"{replayed.lacks_end}: {compared}")
+    result = replayed.result
     document = {
         **msgspec.structs.asdict(result),
         "changed": replayed.changed,
@@ -64,6 +57,19 @@ def replay(
     }
     common.show("log/replay", document, lambda: make_replay_table(replayed))
     return 0 if result.identical else 1
+
+
+def _list_warnings(replayed: ReplayOutcome) -> Iterator[str]:
+    """Return what limits the comparison."""
+    result = replayed.result
+    yield from (f"{text}: decisions may differ" for text in replayed.other_versions)
+    if result.dropped:
+        yield f"{count(result.dropped, 'record')} missing in the recording: what came after cannot be compared"
+    if replayed.holes:
+        yield f"{replayed.holes}: where messages are missing, what came after cannot be compared"
+    if replayed.lacks_end:
+        compared = "compared up to there" if result.decisions else "before its first decision, so nothing was compared"
+        yield f"{replayed.lacks_end}: {compared}"
 
 
 def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Common) -> int:

@@ -28,12 +28,13 @@ from uavctl.cli.common import (
 )
 from uavctl.cli.flying import check_take_off
 from uavctl.cli.tune_run import TuneRequest, TuneResult, run_tuning
-from uavctl.config import Config
+from uavctl.config import Config, LoadedConfig
 from uavctl.config.document import DataFileError, read_text
 from uavctl.config.load import parse_recorded, parse_toml
 from uavctl.errors import UsageError
 from uavctl.lab.tune.change import check_tunable
 from uavctl.lab.tune.excitation import DOWN, SafeBox, add_excitation, check_start, parse_box
+from uavctl.lab.tune.figures import TuneFigures, list_figure_rows
 from uavctl.wiring.controller import build_flight_design
 
 _HORIZONTAL = (0, 1)
@@ -84,39 +85,43 @@ def tune(
         raise UsageError("--seed is of the simulator; add --loopback")
     if loopback and not (vehicle is None and mocap is None):
         raise UsageError("--vehicle and --mocap are of a real vehicle; leave them out with --loopback")
-    extra_overrides = make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap, sim__seed=seed)
     common = Common(config, overrides, json)
-    if loopback and not _chooses_plant(common):
-        extra_overrides.insert(0, "sim.plant=quadrotor")
-    loaded = common.with_overrides(extra_overrides).load()
+    plant = ("sim.plant=quadrotor",) if loopback and not _chooses_plant(common) else ()
+    keys = make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap, sim__seed=seed)
+    loaded = common.with_overrides([*plant, *keys]).load()
     check_tunable(loaded.config)
-    lands = not loopback or take_off_m is not None
     safe_box = None if box is None else parse_box(box)
-    with locate_design_errors(loaded):
-        if safe_box is not None:
-            mission = add_excitation(loaded.config, build_flight_design(loaded.config), safe_box, lands=lands)
-            _check_start(loaded.config, safe_box, take_off_m, simulated=loopback)
-        else:
-            assert flight is not None
-            mission = _take_mission(loaded.config, flight, lands=lands)
-    result = run_tuning(
-        TuneRequest(
-            config=loaded.config,
-            mission=mission,
-            box=safe_box,
-            flight=flight,
-            folder=folder,
-            simulated=loopback,
-            take_off_m=take_off_m,
-            is_agreed=yes or loopback,
-        )
+    request = TuneRequest(
+        config=loaded.config,
+        mission=_make_mission(loaded, safe_box, flight, take_off_m, simulated=loopback),
+        box=safe_box,
+        flight=flight,
+        folder=folder,
+        simulated=loopback,
+        take_off_m=take_off_m,
+        is_agreed=yes or loopback,
     )
+    result = run_tuning(request)
     if result.stopped:
         print_message(label_text("stopped", result.stopped, "bold yellow"))
         print_message(f"Go on with the same command; what is done stays in {folder}.")
     document = {field.name: msgspec.to_builtins(getattr(result, field.name)) for field in dataclasses.fields(result)}
     common.show("tune", document, lambda: Group(*_render(result)))
     return result.exit_code
+
+
+def _make_mission(
+    loaded: LoadedConfig, box: SafeBox | None, flight: Path | None, take_off_m: float | None, *, simulated: bool
+) -> Config:
+    """Return the configuration with the mission of both flights: the excitation in the box, or a recording's."""
+    lands = not simulated or take_off_m is not None
+    with locate_design_errors(loaded):
+        if box is not None:
+            mission = add_excitation(loaded.config, build_flight_design(loaded.config), box, lands=lands)
+            _check_start(loaded.config, box, take_off_m, simulated=simulated)
+            return mission
+        assert flight is not None
+        return _take_mission(loaded.config, flight, lands=lands)
 
 
 def _check_start(config: Config, box: SafeBox, take_off_m: float | None, *, simulated: bool) -> None:
@@ -161,17 +166,8 @@ def _render(result: TuneResult) -> Iterator[RenderableType]:
         headings = ("value", "old", "new", "why")
         yield make_table("Configuration", headings, rows, headings, fold=True)
     if result.figures is not None and result.prediction_m is not None:
-        first, second = result.figures
-        old_m, new_m = result.prediction_m
-        lines = (
-            ("distance from the last waypoint, rms [cm]", first.hold_rms_m, second.hold_rms_m),
-            ("outside the box, at most [cm]", first.beyond_box_m, second.beyond_box_m),
-            ("prediction of the second flight, error [cm]", old_m, new_m),
-        )
-        cells = [
-            (text, *("–" if value is None else f"{100 * value:.1f}" for value in values)) for text, *values in lines
-        ]
-        yield make_table("Before and after", ("", "before", "after"), cells)
+        figure_rows = list_figure_rows(TuneFigures(*result.figures, *result.prediction_m))
+        yield make_table("Before and after", ("", "before", "after"), figure_rows)
     if result.config is not None:
         yield Text(f"configuration: {result.config}")
     if result.report is not None:

@@ -19,8 +19,6 @@ import msgspec
 from logs.recording.flight import FlightData
 from logs.recording.output_files import write_atomically
 from logs.recording.reader import explain_missing_end, read
-from logs.report.compare import compare_flights, load_flights
-from logs.report.compare_page import write_comparison_page
 from uavctl.cause import Cause
 from uavctl.cli.common import print_message, warn
 from uavctl.cli.identify import find_design_warnings, show_fit_progress
@@ -35,7 +33,8 @@ from uavctl.lab.identify.result import count_fits, identify
 from uavctl.lab.tune.box_monitor import MIN_BRAKE_SHARE, TUNED_BRAKE_SHARE, BoxMonitor
 from uavctl.lab.tune.change import Change, tune_config
 from uavctl.lab.tune.excitation import SafeBox, check_start
-from uavctl.lab.tune.figures import TunedFlight, compute_flight_figures, compute_prediction_error_m
+from uavctl.lab.tune.figures import TunedFlight, TuneFigures, compute_flight_figures, compute_prediction_error_m
+from uavctl.lab.tune.page import render_tune_page
 from uavctl.smpc.plant import AXES
 
 SETTINGS_FILE, TUNED_FILE, FIT_PAGE_FILE, PAGE_FILE = "configuration.toml", "tuned.toml", "identified.html", "tune.html"
@@ -124,18 +123,16 @@ def _take_steps(request: TuneRequest, result: TuneResult) -> None:
     )
     after = _fly(request, second, AFTER_FOLDER, TUNED_BRAKE_SHARE)
     result.after = str(after)
-    loaded = load_flights([before, after])
-    write_comparison_page(compare_flights(loaded), loaded, request.folder / PAGE_FILE)
-    result.report = str(request.folder / PAGE_FILE)
-    first_figures, second_figures = (
+    first_flight, second_flight = (
         compute_flight_figures(FlightData.from_records(read(path), path), request.box) for path in (before, after)
     )
-    result.figures = first_figures, second_figures
     history = read_recorded_history(read(after))
-    result.prediction_m = (
-        compute_prediction_error_m(history, request.config),
-        compute_prediction_error_m(history, second),
-    )
+    old_error_m, new_error_m = (compute_prediction_error_m(history, config) for config in (request.config, second))
+    result.figures, result.prediction_m = (first_flight, second_flight), (old_error_m, new_error_m)
+    figures = TuneFigures(first_flight, second_flight, old_error_m, new_error_m)
+    page = request.folder / PAGE_FILE
+    write_atomically(page, render_tune_page(request.config.name, (before, after), TUNED_FILE, figures))
+    result.report = str(page)
 
 
 def _write_tuned(request: TuneRequest, recording: Path) -> tuple[Change, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -38,6 +39,7 @@ from uavctl.cli.replays import (
     match_arithmetic,
 )
 from uavctl.cli.whatif_setup import change_config, choose_plant, make_baseline_controller
+from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse_recorded
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.spec import KINDS
@@ -115,77 +117,120 @@ def whatif(
     if seed is not None and link_name == RECORDED:
         raise UsageError("--seed is of a simulated link; add --link configured, or --link KEY=VALUE")
     check_first_file(flight)
+    link_keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
+    result = fly_what_if(WhatIfRequest(flight, config, overrides, controller, link_name, link_keys, seed, model, out))
+    Common(json=json).show("log/whatif", result, lambda: _render(result))
+    return 0 if result.what_if.steps else 1
+
+
+@dataclass(frozen=True)
+class WhatIfRequest:
+    """What is to be another than in the recorded flight."""
+
+    flight: Path
+    config: str | None  # preset or file in place of the recorded configuration
+    overrides: tuple[str, ...]  # `key=value` each
+    controller: str
+    link_name: str  # how positions come
+    link_keys: tuple[str, ...]  # overrides of the flown link alone, which the design does not know
+    seed: int | None  # of a simulated link
+    model: Path | None  # file with the plant that responds to other setpoints
+    out: Path | None
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether a controller of this package other than the SMPC flies."""
+        return self.controller in KINDS and self.controller != "smpc"
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether a controller of another package flies."""
+        return self.controller not in KINDS
+
+
+def fly_what_if(request: WhatIfRequest) -> WhatIf:
+    """Fly the recorded flight unchanged and changed, record the latter, and write its page.
+
+    Raises:
+        UavctlError: The recording or the change cannot be flown; the message is the reason.
+    """
+    flight = request.flight
     recorded = read_header(flight)
     match_arithmetic(recorded)
     before = parse_recorded(recorded.config_toml, f"{flight} (configuration)").config
-    loaded = change_config(before, recorded.config_toml, flight, config, overrides)
-    keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
-    other_link_config = change_config(before, recorded.config_toml, flight, config, (*overrides, *keys)).config.link
-    plant, source = choose_plant(model, before)
+    loaded = change_config(before, recorded.config_toml, flight, request.config, request.overrides)
+    plant, source = choose_plant(request.model, before)
     with _show_progress() as progress:
         entries = progress.track(read(flight), total=count_messages(flight), description="reading")
         history = make_recorded_flight(entries, before, str(flight))
     response = make_response(history, plant)
     _print_warnings(flight, recorded, history)
     recorded_controller = make_recorded_controller(flight, before)
-    is_outside = controller not in KINDS
-    if is_outside:
-        smpc = replace(loaded.config.smpc, controller=controller)
-        loaded = dataclasses.replace(loaded, config=replace(loaded.config, smpc=smpc))
-    if controller == "smpc" or is_outside:
-        is_unchanged = config is None and not overrides and not is_outside
-        changed_controller = recorded_controller if is_unchanged else make_changed_controller(loaded)
-    else:
-        changed_controller = make_baseline_controller(loaded, controller, _get_start_state(history))
-    other_link = None
-    if link_name != RECORDED:
-        noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
-        other_link = SimulatedLink(history, other_link_config, before.sim.seed if seed is None else seed, noise_m)
+    changed_controller = _make_controller(request, loaded, recorded_controller, history)
+    other_link = None if request.link_name == RECORDED else _make_link(request, recorded, before, history)
     begin_s = time.perf_counter()
-    with create_recording(out, loaded.config.name, before.log) as path, _show_progress() as progress:
-        reproduced = _reproduce(history, recorded_controller, response, _make_watch(progress, "reproducing the flight"))
-        course, status = _record_changed(
-            history,
-            changed_controller,
-            response,
-            other_link,
-            path,
-            recorded,
-            _make_watch(progress, "flying it otherwise"),
-        )
+    with create_recording(request.out, loaded.config.name, before.log) as path, _show_progress() as progress:
+        watch = _make_watch(progress, "reproducing the flight")
+        reproduced = _reproduce(history, recorded_controller, response, watch)
+        watch = _make_watch(progress, "flying it otherwise")
+        course, status = _record_changed(history, changed_controller, response, other_link, path, recorded, watch)
         progress.add_task("writing the pages", total=None)
         conclude_flight(path, time.perf_counter() - begin_s, status)
-        options = (
-            *((f"--config {config}",) if config else ()),
-            *overrides,
-            *((f"--seed {seed}",) if seed is not None else ()),
-        )
-        flights = [
+        first, again, other = (
             FlightData.from_records(cut_entries(entries, course.end_ns))
             for entries in (history.entries, reproduced, tuple(read(path)))
-        ]
+        )
         result = WhatIf(
             flight=str(flight),
-            reproduction=compare_reproduction(flights[0], flights[1]),
+            reproduction=compare_reproduction(first, again),
             model=fit_model(history, response, source),
-            controller=controller,
-            link=link_name,
-            changed=options,
-            compared_s=(course.end_ns - flights[0].origin_ns + flights[0].tick_ns) * 1e-9,
+            controller=request.controller,
+            link=request.link_name,
+            changed=_list_changes(request),
+            compared_s=(course.end_ns - first.origin_ns + first.tick_ns) * 1e-9,
             ended=course.ended,
-            largest_departure_m=compute_max_distance_m(flights[0], flights[2]),
+            largest_departure_m=compute_max_distance_m(first, other),
             inertial_moved=course.inertial_moved,
             inertial_left_out=course.inertial_dropped,
-            recorded=summarise(flights[0], wall_s=None),
-            reproduced=summarise(flights[1], wall_s=None),
-            what_if=summarise(flights[2], wall_s=None),
+            recorded=summarise(first, wall_s=None),
+            reproduced=summarise(again, wall_s=None),
+            what_if=summarise(other, wall_s=None),
             recording=str(path),
             report=str(path.with_suffix(".html")),
             page=str(path.with_name("what-if.html")),
         )
-        write_atomically(Path(result.page), render_what_if_page(result, flights[0], flights[2]))
-    Common(json=json).show("log/whatif", result, lambda: _render(result))
-    return 0 if result.what_if.steps else 1
+        write_atomically(Path(result.page), render_what_if_page(result, first, other))
+    return result
+
+
+def _make_controller(
+    request: WhatIfRequest, loaded: LoadedConfig, recorded_controller: Prepared, history: RecordedFlight
+) -> Prepared:
+    """Return the controller that flies: a baseline, one of another package, or the SMPC, changed or not."""
+    if request.is_baseline:
+        return make_baseline_controller(loaded, request.controller, _get_start_state(history))
+    if request.is_outside:
+        smpc = replace(loaded.config.smpc, controller=request.controller)
+        loaded = dataclasses.replace(loaded, config=replace(loaded.config, smpc=smpc))
+    elif request.config is None and not request.overrides:
+        return recorded_controller
+    return make_changed_controller(loaded)
+
+
+def _make_link(request: WhatIfRequest, recorded: Header, before: Config, history: RecordedFlight) -> SimulatedLink:
+    overrides = (*request.overrides, *request.link_keys)
+    config = change_config(before, recorded.config_toml, request.flight, request.config, overrides).config
+    noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
+    return SimulatedLink(history, config.link, before.sim.seed if request.seed is None else request.seed, noise_m)
+
+
+def _list_changes(request: WhatIfRequest) -> tuple[str, ...]:
+    """Return what differs, as it was given."""
+    return (
+        *((f"--config {request.config}",) if request.config else ()),
+        *request.overrides,
+        *((f"--seed {request.seed}",) if request.seed is not None else ()),
+    )
 
 
 def _print_warnings(flight: Path, recorded: Header, history: RecordedFlight) -> None:

@@ -76,8 +76,7 @@ def drawings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Drawing]:
     folder = write(tmp_path_factory.mktemp("names"), cells, rows)
     summaries, looks = summarise(folder), ControllerStyles(CONTROLLERS)
     verdicts = list(make_verdicts(read_results(folder), group_cells(summaries)))
-    difference = plots.draw_differences(verdicts, looks, f"Beside {CONTROLLERS[0]}", "0")
-    assert difference is not None
+    (difference,) = plots.draw_differences(verdicts, looks, f"Beside {CONTROLLERS[0]}", "0")
     return {"cost": next(plots.draw_quantities(summaries, {}, looks, "0")), "difference": difference}
 
 

@@ -14,8 +14,9 @@ from campaign_results import cell, runs, write
 from report_rig import omit_figures
 from text_numbers import find_numbers
 
-from logs.report.page import render_legend
+from logs.report.page import Section, render_page
 from logs.report.run_statistics import PairedDifference
+from logs.report.svg import Drawing
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.page import CampaignView, describe_outcome, write_report
 from uavctl.lab.campaign.plots import ControllerStyles
@@ -280,7 +281,9 @@ def test_a_legend_has_the_markers_of_its_figure() -> None:
     looks = ControllerStyles(tuple(f"controller {place}" for place in range(12)))
     entries = list(looks.make_marks(looks.controllers))
     assert len({(entry.role, entry.path, entry.full) for entry in entries}) == 12
-    drawn = re.findall(r"<li>.*?</li>", render_legend(entries))
+    drawn = re.findall(
+        r"<li>.*?</li>", render_page("", "", [Section("", lambda _: [Drawing("", "", "")], legend=entries)], None)
+    )
     assert len({re.sub(r"controller \d+", "", label) for label in drawn}) == 12
     assert all(
         f"var(--{entry.role})" in text and entry.path in text for entry, text in zip(entries, drawn, strict=True)

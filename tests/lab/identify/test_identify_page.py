@@ -21,6 +21,7 @@ from uavctl.cli import identify as identify_cmd
 from uavctl.cli.common import Common
 from uavctl.config import load_config
 from uavctl.errors import DesignError, UsageError
+from uavctl.lab.identify import page as identify_page
 from uavctl.lab.identify.fit import Prediction
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory
 from uavctl.lab.identify.page import _draw_innovations, render_identify_page
@@ -33,7 +34,7 @@ HARDLY = "down: only 26 % of the motion of the next second is predicted"
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the sentences at the page's head are read."""
-    monkeypatch.setattr("uavctl.lab.identify.page._make_sections", lambda *_: iter(()))
+    monkeypatch.setattr(identify_page, "_SECTIONS", identify_page._SECTIONS[:1])
 
 
 def make_positions() -> PositionHistory:

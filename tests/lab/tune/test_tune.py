@@ -17,7 +17,7 @@ from uavctl.lab.identify.history import read_recorded_history
 from uavctl.lab.identify.result import Identification, identify
 from uavctl.lab.tune.change import check_tunable, tune_config
 from uavctl.lab.tune.excitation import MIN_STEP_M, SafeBox, add_excitation, check_start, parse_box
-from uavctl.lab.tune.figures import compute_flight_figures
+from uavctl.lab.tune.figures import HoldChange, TunedFlight, compare_holds, compute_flight_figures
 from uavctl.wiring.controller import build_flight_design
 
 BOX = parse_box("-1.5,-1.4,-2,1.5,1.4,-0.4")
@@ -186,3 +186,21 @@ def test_the_hold_is_judged_where_the_vehicle_truly_was(flight: tuple[Config, Fl
     truth = np.array([sample.state for sample in flown.truths])[:, list(flown.design.position_index)]
     inside = np.minimum(truth - np.array(BOX.lower), np.array(BOX.upper) - truth).min()
     assert figures.beyond_box_m == pytest.approx(-inside, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("before_m", "after_m", "change"),
+    [
+        (0.03, 0.02, HoldChange.BETTER),
+        (0.02, 0.03, HoldChange.WORSE),
+        (0.0200, 0.0235, HoldChange.ALIKE),
+        (0.0200, 0.0165, HoldChange.ALIKE),
+        (None, 0.02, HoldChange.UNKNOWN),
+        (0.02, None, HoldChange.UNKNOWN),
+    ],
+)
+def test_the_better_flight_is_the_one_nearer_to_its_last_waypoint(
+    before_m: float | None, after_m: float | None, change: HoldChange
+) -> None:
+    before, after = (TunedFlight(hold_rms_m=value, beyond_box_m=None) for value in (before_m, after_m))
+    assert compare_holds(before, after) is change

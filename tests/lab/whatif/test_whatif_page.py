@@ -14,6 +14,7 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import FlightSummary, summarise
+from logs.report.plots import DISPLAY_AXES
 from logs.report.svg import colour
 from uavctl.lab.whatif.comparison import ModelFit, Reproduction, WhatIf, describe_what_if, render_what_if_page
 
@@ -64,9 +65,9 @@ def worse_link(summary: FlightSummary) -> WhatIf:
     )
 
 
-def levels(ax: Axes) -> list[float]:
-    """Heights of the horizontal lines in the colour of limits."""
-    lines = [line for line in ax.lines if to_hex(line.get_color()) == to_hex(colour("limit"))]
+def levels(ax: Axes, role: str = "limit") -> list[float]:
+    """Heights of the horizontal lines in the colour of a role."""
+    lines = [line for line in ax.lines if to_hex(line.get_color()) == to_hex(colour(role))]
     return sorted(float(np.asarray(line.get_ydata())[0]) for line in lines)
 
 
@@ -74,7 +75,9 @@ def test_limits_are_those_of_the_what_if(recorded: FlightData, other: FlightData
     axes, _ = figures(recorded, other)
     box = other.design.state_box
     for name, index in zip(other.design.axes, other.design.position_index, strict=True):
-        assert levels(axes[name]) == pytest.approx(sorted((box.lower[index], box.upper[index])))
+        title, sign = DISPLAY_AXES[name]
+        wanted = sorted(sign * side for side in (box.lower[index], box.upper[index]))
+        assert levels(axes[title.capitalize()]) == pytest.approx(wanted)
     first = other.design.position_index[0]
     assert box.upper[first] == pytest.approx(recorded.design.state_box.upper[first] - 0.25)
 
@@ -83,14 +86,16 @@ def test_the_reserve_is_the_largest_of_each_plan(recorded: FlightData, other: Fl
     axes, _ = figures(recorded, other)
     design = other.design
     for name, index in zip(design.axes, design.position_index, strict=True):
-        row = design.state_box.row_upper[index]
+        title, sign = DISPLAY_AXES[name]
+        row = (design.state_box.row_upper if sign > 0 else design.state_box.row_lower)[index]
+        limit = max(sign * side for side in (design.state_box.lower[index], design.state_box.upper[index]))
         scale = abs(design.c_x[row][index])
         drawings = [max(stage[row] for stage in plan.backoff_x) / scale for plan in other.flown_plans.values()]
-        edges = [band.get_paths()[0].get_extents() for band in axes[name].collections]
+        edges = [band.get_paths()[0].get_extents() for band in axes[title.capitalize()].collections]
         assert len(edges) == 2
         above = max(edges, key=lambda edge: edge.y1)
-        assert above.y1 == pytest.approx(design.state_box.upper[index])
-        assert above.y0 == pytest.approx(design.state_box.upper[index] - max(drawings))
+        assert above.y1 == pytest.approx(limit)
+        assert above.y0 == pytest.approx(limit - max(drawings))
 
 
 def test_another_link_is_listed_as_a_change(recorded: FlightData) -> None:
@@ -109,5 +114,5 @@ def test_dropped_inertial_messages_are_reported(recorded: FlightData) -> None:
 
 def test_the_age_is_drawn_against_the_horizon(recorded: FlightData, other: FlightData) -> None:
     axes, text = figures(recorded, other)
-    assert levels(axes["Age of the newest position"]) == [7.0]
-    assert "horizon H = 7" in text and "reserve kept" in text
+    assert levels(axes["Age of information"], "muted") == sorted([7.0, recorded.design.horizon])
+    assert "H = 7 steps" in text and "reserve kept" in text

@@ -16,13 +16,14 @@ from synthetic_flight import fly
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import summarise
+from logs.recording.summary import find_input_violations, find_state_violations, summarise
 from logs.report.cursor import render_cursor_script
+from logs.report.evidence import FlightEvidence
 from logs.report.excursion import find_excursions
 from logs.report.findings import Headline
 from logs.report.headline import derive_headline
 from logs.report.path_3d import draw_path_3d
-from logs.report.plots import draw_path_views, find_input_violations, find_moving_limits, find_state_violations
+from logs.report.plots import draw_path_views, find_moving_limits
 from logs.report.verdicts import Judgement, judge_flight
 from uavctl.cause import BAD, CAUTION, GOOD, Cause
 from uavctl.records import Setpoint, SetpointSource, Truth
@@ -39,7 +40,8 @@ WENT = re.compile(r"went ([\d.]+) (m|mm) (?:through the (.*?)|below the (floor))
 
 
 def head(flight: FlightData, judged: Judgement | None = None) -> Headline:
-    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight) if judged is None else judged)
+    judged = judge_flight(flight) if judged is None else judged
+    return derive_headline(FlightEvidence(flight, summarise(flight, wall_s=None), judged))
 
 
 def went(text: str) -> tuple[float, str, float]:
@@ -199,7 +201,7 @@ def test_the_place_is_marked_in_each_view_of_the_path(flight: FlightData) -> Non
     def marked(flight: FlightData) -> list[list[str]]:
         with collect_figures() as figures:
             list(draw_path_views(flight))
-            draw_path_3d(flight)
+            list(draw_path_3d(flight))
         texts = [[text.get_text() for text in figure.axes[0].texts] for figure in figures.values()]
         return [[text for text in each if text.startswith("left at") or " m out at " in text] for each in texts]
 

@@ -21,6 +21,7 @@ from logs.recording.flight import FlightData
 from logs.recording.mavlink_flight import read_flight
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.summary import compute_course_error, compute_position_errors_m, summarise
+from logs.report.evidence import FlightEvidence
 from logs.report.findings import Headline, sort_findings
 from logs.report.headline import derive_headline
 from logs.report.tlog_headline import derive_tlog_headline
@@ -38,7 +39,7 @@ PILOTS = {"px4": "POSCTL", "ardupilot": "LOITER"}
 
 
 def head(flight: FlightData) -> Headline:
-    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight))
+    return derive_headline(FlightEvidence(flight, summarise(flight, wall_s=None), judge_flight(flight)))
 
 
 def flown(autopilot: str, duration_s: float, *overrides: str) -> FlightData:
@@ -338,7 +339,7 @@ def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData
     headline = head(add_event(failed, 1.0, "vehicle-text", "Max Alt fence breached", Severity.INFO))
     assert headline.causes[:3] == (Cause.BATTERY_EMPTY, Cause.VEHICLE_FENCE, Cause.VEHICLE_FAILSAFE)
     assert sort_findings([]) == []
-    assert classify_text("PreArm: Battery Failsafe", is_error=True, is_warning=True) is None
+    assert classify_text("PreArm: Battery Failsafe", Severity.ERROR) is None
 
 
 @pytest.mark.parametrize(("lets_go", "reason"), [(False, "held back"), (True, "held back"), (True, "nothing comes")])

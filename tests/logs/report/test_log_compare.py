@@ -21,7 +21,7 @@ from logs.recording.flight import FlightData
 from logs.recording.recorder import SyncRecorder
 from logs.recording.summary import summarise
 from logs.report.compare import Figure, FlightComparison, compare_flights, load_flights
-from logs.report.compare_page import render_comparison
+from logs.report.compare_page import ComparisonView, render_comparison
 from uavctl.cli.app import run
 from uavctl.cli.log_report import render_terminal_comparison
 from uavctl.records import Datagram, Decision, Header, Record, Timing
@@ -221,7 +221,7 @@ def test_a_page_of_many_flights_has_tables_that_paper_can_hold(
     loaded = load_flights([*paths, *paths, paths[0]])
     comparison = compare_flights(loaded)
     with omit_figures():
-        page = render_comparison(comparison, loaded)
+        page = render_comparison(ComparisonView(comparison, loaded))
     heads = [re.findall(r"<th>|<th class=\"number\">", head) for head in re.findall(r"<thead>.*?</thead>", page)]
     assert max(map(len, heads)) <= 8
     for name in "BCDE":

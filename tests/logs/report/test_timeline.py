@@ -11,7 +11,7 @@ from synthetic_scene import paper, room
 
 from logs.recording.flight import FlightData
 from logs.report.path_3d import compute_grid_m, draw_path_3d, outline_ellipsoid, project_3d
-from logs.report.timeline import draw_timeline, make_lanes
+from logs.report.timeline import describe_lanes, list_hidden_texts, make_lanes
 from uavctl.event_codes import EventCode
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Event, Order, Severity, StepInput, VehicleStatus
@@ -74,9 +74,9 @@ def test_marks_are_where_things_happened(flight: FlightData) -> None:
 
 def test_bars_too_short_for_their_text_are_explained(flight: FlightData) -> None:
     told = (enter_state(3.0, HandoverState.ENGAGED, flight.origin_ns),)
-    *_, meanings = draw_timeline(dataclasses.replace(flight, events=told))
+    meanings = describe_lanes(dataclasses.replace(flight, events=told))
     assert "a step without a new position" in meanings and "an error" not in meanings
-    short = draw_timeline(FlightData.from_records(fly(room(), 60.0, blackout=(4.0, 8.0))))[2]
+    short = list_hidden_texts(FlightData.from_records(fly(room(), 60.0, blackout=(4.0, 8.0))))
     assert any(mark.kind == "band" and mark.text == "brake" for mark in short)
 
 
@@ -118,4 +118,4 @@ def test_a_floor_of_any_size_has_few_lines(side: float) -> None:
 
 
 def test_a_plant_of_two_axes_has_no_depth() -> None:
-    assert draw_path_3d(FlightData.from_records(fly(paper(), 5.0))) is None
+    assert not list(draw_path_3d(FlightData.from_records(fly(paper(), 5.0))))

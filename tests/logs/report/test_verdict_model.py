@@ -8,19 +8,18 @@ import msgspec
 import numpy as np
 import pytest
 from loopback_rig import lockstep
-from numpy.typing import NDArray
 from verdict_rig import room, simulate_model
 
 from logs.recording.flight import FlightData
 from logs.report.innovations import FilterReplay, InnovationSamples, compute_innovations
 from logs.report.verdict_model import LAGS, MIN_ERRORS, judge_innovations
 from logs.report.verdicts import judge_flight
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman
 from uavctl.records import ControlMode
 from uavctl.wiring.controller import build_estimator, build_plant
 
-Array = NDArray[np.float64]
 AXES = ("north", "east", "down")
 
 

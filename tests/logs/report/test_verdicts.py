@@ -57,8 +57,6 @@ def test_violations_at_steps_with_news_are_trials() -> None:
     assert (first.name, first.measured.hits) == ("upper limit of north position", 2)
     assert verdict.unpromised == 1
     assert not verdict.refuted
-    assert f"{states.measured.hits} of {states.measured.trials} steps" in verdict.text
-    assert "nothing speaks against" in verdict.text and "not prove it" in verdict.text
     assert verdict.source == "truth"
 
 
@@ -92,7 +90,6 @@ def test_too_many_violations_refute_the_promise() -> None:
     states = verdict.limits[0]
     assert states.refuted and states.p_value is not None and states.p_value < 1e-6
     assert states.measured.low > 0.05
-    assert f"all states outside at 30 of {states.measured.trials}" in verdict.text and "broken" in verdict.text
 
 
 def test_where_a_plan_gave_way_nothing_was_promised() -> None:
@@ -102,7 +99,6 @@ def test_where_a_plan_gave_way_nothing_was_promised() -> None:
     assert verdict.limits[0].measured.trials == 0
     assert verdict.unpromised == len(found.steps)
     assert not verdict.refuted
-    assert "No step was flown" in verdict.text
 
 
 def test_the_fallback_promises_nothing() -> None:
@@ -116,7 +112,6 @@ def test_an_unknown_promise_is_said_to_be_unknown() -> None:
     verdict = judge_risk(flight(8.0), None)
     assert verdict.limits[0].promised is None
     assert not verdict.refuted
-    assert "not known any more" in verdict.text
 
 
 def link_config(**link: object) -> Config:
@@ -141,7 +136,6 @@ def test_news_and_ages_by_hand() -> None:
 def test_a_link_worse_than_promised_is_found() -> None:
     verdict = judge_link(simulate_model(room_config(), 600, seed=2, loss=0.5), room_config())
     assert verdict.refuted
-    assert "fewer than promised" in verdict.text
 
 
 def test_bursts_are_found_where_losses_are_taken_for_independent() -> None:
@@ -150,7 +144,6 @@ def test_bursts_are_found_where_losses_are_taken_for_independent() -> None:
     held = tuple(msgspec.structs.replace(d, age_steps=blocks[d.step]) for d in found.decisions)
     verdict = judge_link(dataclasses.replace(found, decisions=held), room_config())
     assert verdict.bursts and verdict.refuted
-    assert "in bursts" in verdict.text
     independent = estimate_share(verdict.news.hits, verdict.news.trials)
     assert verdict.news.high - verdict.news.low > 2.0 * (independent.high - independent.low)
 
@@ -201,7 +194,6 @@ def test_drift_and_residual_of_a_clock_by_hand() -> None:
     assert verdict.drift_ppm == pytest.approx(20.0, abs=0.05)
     assert verdict.residual_us == pytest.approx(5.0, rel=0.02)
     assert (verdict.rtt_ms, verdict.rejected, verdict.counted, verdict.source) == (2.0, 3, 40, "timesync")
-    assert "TIMESYNC" in verdict.text and "5 µs" in verdict.text
     assert len(compute_offset_residuals(found, "mocap")[1]) == 40
 
 
@@ -209,7 +201,6 @@ def test_an_offset_told_twice_is_not_judged() -> None:
     found = dataclasses.replace(flight(8.0), links=(stats(1.0, 1.0), stats(2.0, 1.0)))
     (verdict,) = judge_clocks(found)
     assert verdict.drift_ppm is None
-    assert "too seldom" in verdict.text
 
 
 def circling(late_ns: int) -> FlightData:

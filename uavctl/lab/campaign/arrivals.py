@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.config.link import LinkConfig
 from uavctl.smpc.batch import Counts
-
-Flags = NDArray[np.bool_]
 
 _ROUNDING = 1e-9  # share of a step; less is rounding
 

@@ -10,9 +10,22 @@ from typing import Self
 from markupsafe import Markup
 
 from logs.recording.summary import count
-from logs.report import page
-from logs.report.page import Mark, PageSection
+from logs.report.findings import Banner
+from logs.report.page import (
+    NOTHING,
+    Mark,
+    Part,
+    Section,
+    render_facts,
+    render_folded,
+    render_list,
+    render_page,
+    render_parts,
+    render_strong,
+    render_table,
+)
 from logs.report.run_statistics import Interval
+from uavctl.cause import BAD, CAUTION, GOOD
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign import plots
 from uavctl.lab.campaign.plots import ControllerStyles
@@ -111,20 +124,18 @@ def _group_by_promise(view: CampaignView) -> tuple[list[CellSummary], list[CellS
     return promising, exceeding, significant
 
 
-def _render_banner(view: CampaignView) -> Markup:
-    """Return the banner as HTML: failed runs, and whether rates stayed within the allowed ones."""
+def _judge_campaign(view: CampaignView) -> Banner | None:
+    """Return the first line: failed runs, else whether rates stayed within the allowed ones; None without either."""
     failed, flown = sum(cell.failed for cell in view.cells), sum(cell.runs for cell in view.cells)
     promise = _judge_promise(view)
-    if failed:
-        details = () if promise is None else (f"{promise[1]}: {promise[2]}",)
-        return page.render_banner(
-            "bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", details
-        )
-    return page.NOTHING if promise is None else page.render_banner(*promise, ())
+    if not failed:
+        return promise
+    reasons = () if promise is None else (f"{promise.word}: {promise.text}",)
+    return Banner(BAD, "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", reasons)
 
 
-def _judge_promise(view: CampaignView) -> tuple[str, str, str] | None:
-    """Return whether rates stayed within the allowed ones: tone, title and text; None without any allowed rate."""
+def _judge_promise(view: CampaignView) -> Banner | None:
+    """Return whether rates stayed within the allowed ones; None without any allowed rate."""
     promising, exceeding, significant = _group_by_promise(view)
     if not promising:
         return None
@@ -138,10 +149,12 @@ def _judge_promise(view: CampaignView) -> tuple[str, str, str] | None:
         others_text = (
             f", and {len(exceeding) - len(significant)} within chance" if len(exceeding) > len(significant) else ""
         )
-        return "bad", "Promise broken", f"by {len(significant)} of {cells}, beyond chance{others_text}; {worst_text}."
+        text = f"by {len(significant)} of {cells}, beyond chance{others_text}; {worst_text}."
+        return Banner(BAD, "Promise broken", text)
     if exceeding:
-        return "mind", "Perhaps too often", f"in {len(exceeding)} of {cells}, within chance; {worst_text}."
-    return "good", "Promise kept", f"by all of {cells}; {worst_text}."
+        text = f"in {len(exceeding)} of {cells}, within chance; {worst_text}."
+        return Banner(CAUTION, "Perhaps too often", text)
+    return Banner(GOOD, "Promise kept", f"by all of {cells}; {worst_text}.")
 
 
 def _describe_steps(view: CampaignView) -> Iterator[str]:
@@ -160,24 +173,12 @@ def _describe_steps(view: CampaignView) -> Iterator[str]:
 
 PAGE = "report.html"
 _SHOWN_FAILURES = 50
-_LIMIT_LABEL = "allowed by the SMPC's design"
 _INTERVAL_NOTE = (
     "Intervals are at 95 %. The steps of a run are not independent, so the interval of a rate of steps is a bootstrap "
     "over runs (with fewer than 20 runs concerned: the exact interval of the share of such runs, times what a run of "
     "them has on average). The exact interval (Clopper and Pearson) is that of the share of runs with any step "
     "outside. Costs have a bootstrap over runs, beyond 2000 runs its normal approximation. Runs that failed are in no "
-    "figure."
-)
-_DIFFERENCE_TITLE = "What each baseline costs more than the SMPC"
-_VERDICT_TITLE = "Does the SMPC cost less, at equal or lower violation rates?"
-_DIFFERENCE_NOTE = (
-    "All controllers meet the same disturbances and the same losses, so their costs are subtracted run by run; the "
-    "interval is that of the mean difference, over the SMPC's mean cost. Right of zero the SMPC costs less."
-)
-_VERDICT_NOTE = (
-    "“Yes” where every baseline costs more than the SMPC, or breaks state or input limits more often: none is as cheap "
-    "at equal or lower rates. The columns say what each baseline costs, over the SMPC's cost. Less and more are judged "
-    "by the intervals of the differences run by run."
+    "figure. An arrow stands at the upper end of the interval of a rate of zero."
 )
 
 
@@ -210,33 +211,19 @@ def write_html(folder: Path, text: str) -> Path:
 def render_specification(folder: Path) -> Markup:
     """Return the campaign's file as folded HTML; empty where it is missing."""
     try:
-        return page.render_folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
+        return render_folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
     except OSError:
-        return page.NOTHING
+        return NOTHING
 
 
 def render_report(results: Results) -> str:
     """Return the page of a campaign as HTML."""
     view = CampaignView.make(results)
     subtitle = f"{count(len(view.cells), 'cell')} · seed {results.master} · uavctl {results.version}"
-    return page.render_page(
-        f"Campaign “{results.name}”", subtitle, describe_outcome(view), _make_sections(view), top=_render_banner(view)
-    )
+    return render_page(f"Campaign “{results.name}”", subtitle, _list_sections(view), view, _judge_campaign(view))
 
 
-def _make_sections(view: CampaignView) -> Iterator[PageSection]:
-    yield _make_compared_section(view)
-    yield _make_verdict_section(view)
-    yield _make_difference_section(view)
-    for place, (scene, cells) in enumerate(view.cells_by_scene.items()):
-        yield from _make_scene_section(view, scene, cells, f"s{place}")
-    yield from _make_path_section(view)
-    yield _make_age_section(view)
-    yield _make_cells_section(view)
-    yield _make_failures_section(view)
-
-
-def _make_compared_section(view: CampaignView) -> PageSection:
+def _show_compared(view: CampaignView) -> Iterator[Part]:
     cells, results = view.cells, view.results
 
     def join_names(values: Iterator[str]) -> str:
@@ -250,27 +237,25 @@ def _make_compared_section(view: CampaignView) -> PageSection:
         ("Runs of a cell", f"{results.planned} of {count(results.steps, 'step')}"),
         ("Seed", f"{results.master}; run i of every cell has the draws of (seed, i)"),
     ]
-    return PageSection("What was compared", "", page.render_facts(rows) + render_specification(results.folder))
+    yield render_facts(rows)
+    yield render_specification(results.folder)
 
 
-def _make_verdict_section(view: CampaignView) -> PageSection:
-    if not view.verdicts:
-        return PageSection(_VERDICT_TITLE, "", page.render_paragraph("No SMPC was flown."))
+def _show_verdicts(view: CampaignView) -> Iterator[Part]:
+    """Return a table of the verdicts with a figure for each baseline, and the verdicts in words."""
     baselines = dict.fromkeys(comparison.baseline.controller for v in view.verdicts for comparison in v.comparisons)
-    rows, explanations = [], []
+    rows: list[tuple[str, ...]] = []
+    explanations: list[Part] = []
     for verdict in view.verdicts:
         name = _name_verdict(view, verdict)
         texts = {comparison.baseline.controller: describe_briefly(comparison) for comparison in verdict.comparisons}
         if verdict.comparisons:
             rows.append((name, get_verdict_word(verdict), *(texts.get(baseline, "–") for baseline in baselines)))
-        explanations += [page.render_strong(name), page.render_list(describe_verdict(verdict))]
-    folded = page.render_folded("In words, with figures and reasons", page.join(explanations))
-    if not rows:
-        return PageSection(_VERDICT_TITLE, _VERDICT_NOTE, folded)
-    columns = ("", "best at its rate", *baselines)
-    return PageSection(
-        _VERDICT_TITLE, _VERDICT_NOTE, page.render_table(columns, rows, frozenset(), kind="dense") + folded
-    )
+        explanations += [render_strong(name), render_list(describe_verdict(verdict))]
+    if rows:
+        yield render_table(("", "best at its rate", *baselines), rows, frozenset(), kind="dense")
+    if explanations:
+        yield render_folded("In words, with figures and reasons", render_parts(explanations))
 
 
 def _name_verdict(view: CampaignView, verdict: CampaignVerdict) -> str:
@@ -280,43 +265,35 @@ def _name_verdict(view: CampaignView, verdict: CampaignVerdict) -> str:
 
 
 def _make_scene_section(
-    view: CampaignView, scene: tuple[str, str], cells: Sequence[CellSummary], key: str
-) -> Iterator[PageSection]:
+    view: CampaignView, scene: tuple[str, str], cells: Sequence[CellSummary], index: int
+) -> Section[CampaignView]:
+    """Make the section on costs and limits in one disturbance and plant."""
     losses = {
         cell.link: cell.link_loss for cell in view.results.cells if cell.link_loss is not None and not cell.refused
     }
-    drawings = list(plots.draw_quantities(cells, losses, view.styles, key))
-    if drawings:
-        note = (
-            ""
-            if key != "s0"
-            else _INTERVAL_NOTE + " An arrow stands at the upper end of the interval of a rate of zero."
-        )
-        flown = {cell.controller for cell in cells if cell.cost is not None}
-        body = page.render_legend(
-            [*view.styles.make_marks(flown), Mark("dashed", "limit", _LIMIT_LABEL)]
-        ) + page.render_grid(drawings)
-        yield PageSection(f"Costs and limits{_make_suffix(view, scene)}", note, body)
+    flown = {cell.controller for cell in cells if cell.cost is not None}
+    return Section(
+        f"Costs and limits{_make_suffix(view, scene)}",
+        lambda view: plots.draw_quantities(cells, losses, view.styles, f"s{index}"),
+        note=_INTERVAL_NOTE if index == 0 else "",
+        legend=(*view.styles.make_marks(flown), Mark("dashed", "limit", "allowed by the SMPC's design")),
+    )
 
 
-def _make_difference_section(view: CampaignView) -> PageSection:
-    drawings = []
+def _draw_differences(view: CampaignView) -> Iterator[Part]:
+    """Draw what the baselines cost more than each SMPC, for each disturbance and plant."""
     for scene_index, scene in enumerate(view.cells_by_scene):
         for number, controller in enumerate(view.styles.controllers):
             scene_verdicts = [v for v in view.verdicts if v.smpc.controller == controller and v.group[1:] == scene]
             title = f"Beside {controller}{_make_suffix(view, scene)}"
-            drawing = plots.draw_differences(scene_verdicts, view.styles, title, f"s{scene_index}-{number}")
-            if drawing is not None:
-                drawings.append(drawing)
+            yield from plots.draw_differences(scene_verdicts, view.styles, title, f"s{scene_index}-{number}")
+
+
+def _list_baseline_marks(view: CampaignView) -> Iterator[Mark]:
     compared = [comparison for verdict in view.verdicts for comparison in verdict.comparisons]
-    if not drawings:
-        return PageSection(_DIFFERENCE_TITLE, "", page.render_paragraph("There is nothing to compare."))
-    baselines = {comparison.baseline.controller for comparison in compared}
-    marks = [*view.styles.make_marks(baselines)]
+    yield from view.styles.make_marks({comparison.baseline.controller for comparison in compared})
     if not all(comparison.is_as_safe for comparison in compared):
-        marks.append(Mark("cross", "ink", "the SMPC breaks limits more often"))
-    body = page.render_legend(marks) + page.render_grid(drawings)
-    return PageSection(_DIFFERENCE_TITLE, _DIFFERENCE_NOTE, body)
+        yield Mark("cross", "ink", "the SMPC breaks limits more often")
 
 
 def _make_suffix(view: CampaignView, scene: tuple[str, str]) -> str:
@@ -325,18 +302,8 @@ def _make_suffix(view: CampaignView, scene: tuple[str, str]) -> str:
     return f": {scene_name}" if scene_name else ""
 
 
-def _make_age_section(view: CampaignView) -> PageSection:
-    note = "Every controller meets the same losses, so the ages are those of the link."
-    if not any(cell.ages for cell in view.cells):
-        return PageSection("Age of information", "", page.render_paragraph("No run ended in order."))
-    figures = page.render_grid([plots.draw_ages(view.cells, view.results)])
-    return PageSection("Age of information", note, page.render_legend(plots.make_age_legend(view.cells)) + figures)
-
-
-def _make_path_section(view: CampaignView) -> Iterator[PageSection]:
-    """Yield the section on paths through the room; none for a box of other units, which has no walls."""
-    if all(cell.beyond_m is None for cell in view.cells):
-        return
+def _show_paths(view: CampaignView) -> Iterator[Part]:
+    """Return a table on the paths through the room."""
     columns = (
         "controller",
         "where",
@@ -357,12 +324,7 @@ def _make_path_section(view: CampaignView) -> Iterator[PageSection]:
         for cell in view.cells
         if not cell.refused
     ]
-    note = (
-        "To 0.3 m, to 0.1 m: first time so near to the target, median of the runs. Hold: distance from it in the "
-        "second half of a run, median. Beyond a wall: furthest of all runs; negative is the room that was left. Usable "
-        "room: share of it in which a plan may rest."
-    )
-    yield PageSection("Through the room", note, page.render_table(columns, rows, frozenset(range(2, 7)), kind="dense"))
+    yield render_table(columns, rows, frozenset(range(2, 7)), kind="dense")
 
 
 _CELL_COLUMNS = (
@@ -372,20 +334,14 @@ _CELL_COLUMNS = (
 )  # fmt: skip
 
 
-def _make_cells_section(view: CampaignView) -> PageSection:
-    tables = []
+def _show_cells(view: CampaignView) -> Iterator[Part]:
+    """Return a folded table of all figures for each link, disturbance and plant."""
     for group, cells in view.groups.items():
         rows = [_make_row(cell) for cell in cells if not cell.refused]
         refused = [f"{cell.index} {cell.controller}: no design; {cell.refused}" for cell in cells if cell.refused]
-        body = page.render_table(_CELL_COLUMNS, rows, frozenset(range(len(_CELL_COLUMNS))) - {1}, refused, kind="dense")
-        tables.append(page.render_folded(view.name_group(group), body))
-    note = (
-        "States and inputs outside: share of steps. Settled: second half of the runs. Worst step: share of runs with a "
-        "state outside in the step with the most, its exact interval for all steps at once (Bonferroni). Runs with "
-        "any: share of runs with a state outside. No plan left: steps in which the SMPC braked. No plan found, limits "
-        "eased: decisions. Oldest: largest age in steps."
-    )
-    return PageSection("All figures", note, page.join(tables))
+        numbers = frozenset(range(len(_CELL_COLUMNS))) - {1}
+        table = render_table(_CELL_COLUMNS, rows, numbers, refused, kind="dense")
+        yield render_folded(view.name_group(group), table)
 
 
 def _make_row(cell: CellSummary) -> tuple[str, ...]:
@@ -422,18 +378,71 @@ def _format_interval(interval: Interval, digits: int) -> str:
     return f"({interval[0]:.{digits}g} to {interval[1]:.{digits}g})".replace(" ", "\N{NO-BREAK SPACE}")
 
 
-def _make_failures_section(view: CampaignView) -> PageSection:
-    failed = [
+def _list_failures(view: CampaignView) -> list[tuple[str, ...]]:
+    """Return the failed runs: cell, controller, where, run and reason."""
+    return [
         (str(cell.index), cell.controller, view.name_group(get_group(cell)), str(run), error)
         for cell in view.cells
         for run, error in view.results.runs[cell.index].failed
     ]
-    shown = failed[:_SHOWN_FAILURES]
-    columns = ("cell", "controller", "where", "run", "what ended it")
-    body = (
-        page.render_table(columns, shown, frozenset({0, 3}), kind="dense")
-        if shown
-        else page.render_paragraph("There were none.")
+
+
+def _show_failures(view: CampaignView) -> Iterator[Part]:
+    rows = _list_failures(view)[:_SHOWN_FAILURES]
+    if rows:
+        columns = ("cell", "controller", "where", "run", "what ended it")
+        yield render_table(columns, rows, frozenset({0, 3}), kind="dense")
+
+
+def _explain_failures(view: CampaignView) -> str:
+    total = len(_list_failures(view))
+    return "" if total <= _SHOWN_FAILURES else f"The first {_SHOWN_FAILURES} of {total}; runs.parquet has all."
+
+
+def _list_sections(view: CampaignView) -> Iterator[Section[CampaignView]]:
+    """Return the page's list; there is a section on costs and limits for each disturbance and plant."""
+    yield Section("What happened", lambda view: [render_list(describe_outcome(view))])
+    yield Section("What was compared", _show_compared)
+    yield Section(
+        "Does the SMPC cost less, at equal or lower violation rates?",
+        _show_verdicts,
+        note="“Yes” where every baseline costs more than the SMPC, or breaks state or input limits more often: none is "
+        "as cheap at equal or lower rates. The columns say what each baseline costs, over the SMPC's cost. Less and "
+        "more are judged by the intervals of the differences run by run.",
+        otherwise="No SMPC was flown.",
     )
-    note = "" if len(shown) == len(failed) else f"The first {len(shown)} of {len(failed)}; runs.parquet has all."
-    return PageSection("Runs that failed", note, body)
+    yield Section(
+        "What each baseline costs more than the SMPC",
+        _draw_differences,
+        note="All controllers meet the same disturbances and the same losses, so their costs are subtracted run by "
+        "run; the interval is that of the mean difference, over the SMPC's mean cost. Right of zero the SMPC costs "
+        "less.",
+        legend=_list_baseline_marks,
+        otherwise="There is nothing to compare.",
+    )
+    for index, (scene, cells) in enumerate(view.cells_by_scene.items()):
+        yield _make_scene_section(view, scene, cells, index)
+    yield Section(
+        "Through the room",
+        _show_paths,
+        when=lambda view: any(cell.beyond_m is not None for cell in view.cells),  # a box of other units has no walls
+        note="To 0.3 m, to 0.1 m: first time so near to the target, median of the runs. Hold: distance from it in the "
+        "second half of a run, median. Beyond a wall: furthest of all runs; negative is the room that was left. Usable "
+        "room: share of it in which a plan may rest.",
+    )
+    yield Section(
+        "Age of information",
+        lambda view: plots.draw_ages(view.cells, view.results),
+        note="Every controller meets the same losses, so the ages are those of the link.",
+        legend=lambda view: plots.make_age_legend(view.cells),
+        otherwise="No run ended in order.",
+    )
+    yield Section(
+        "All figures",
+        _show_cells,
+        note="States and inputs outside: share of steps. Settled: second half of the runs. Worst step: share of runs "
+        "with a state outside in the step with the most, its exact interval for all steps at once (Bonferroni). Runs "
+        "with any: share of runs with a state outside. No plan left: steps in which the SMPC braked. No plan found, "
+        "limits eased: decisions. Oldest: largest age in steps.",
+    )
+    yield Section("Runs that failed", _show_failures, note=_explain_failures, otherwise="There were none.")

@@ -253,7 +253,7 @@ def _draw_by_link(quantity: Quantity, cells: Sequence[CellSummary], styles: Cont
 
 def draw_differences(
     verdicts: Sequence[CampaignVerdict], styles: ControllerStyles, title: str, key: str
-) -> Drawing | None:
+) -> Iterator[Drawing]:
     """Draw the paired cost difference of each baseline to one SMPC by link, over the SMPC's cost."""
     shown = [
         verdict
@@ -261,7 +261,7 @@ def draw_differences(
         if any(comparison.extra_cost_share is not None for comparison in verdict.comparisons)
     ]
     if not shown:
-        return None
+        return
     labels = [fill(verdict.group[0], _LABEL_WIDTH) for verdict in shown]
     baselines = list(
         dict.fromkeys(comparison.baseline.controller for verdict in shown for comparison in verdict.comparisons)
@@ -282,7 +282,7 @@ def draw_differences(
         ax.xaxis.set_major_formatter(FuncFormatter(format_plain))
         ax.xaxis.set_minor_formatter(NullFormatter())
         draw_rows(ax, labels)
-    return Drawing(name, canvas.svg, f"{title}: what each baseline costs more, by link, with its interval")
+    yield Drawing(name, canvas.svg, f"{title}: what each baseline costs more, by link, with its interval")
 
 
 def _draw_difference(ax: Axes, comparison: BaselineComparison, position: float, styles: ControllerStyles) -> None:
@@ -297,17 +297,19 @@ def _draw_difference(ax: Axes, comparison: BaselineComparison, position: float, 
     ax.plot(mean, position, ls="", marker=marker, ms=4.4, mew=width, color=paint, mfc=face)
 
 
-def draw_ages(cells: Sequence[CellSummary], results: Results) -> Drawing:
-    """Draw the share of steps with an age of information of at least j, by link."""
+def draw_ages(cells: Sequence[CellSummary], results: Results) -> Iterator[Drawing]:
+    """Draw the share of steps with an age of information of at least j, by link; nothing where no run was flown."""
     by_link: dict[str, list[int]] = {}
     for cell in cells:
         if cell.ages and len(cell.ages) >= len(by_link.get(cell.link, [])):
             by_link[cell.link] = cell.ages
+    if not by_link:
+        return
     steps = results.planned * results.steps
     label = f"Share of {steps} steps in which the age of information is at least j, by link"
     with open_canvas("ages", 2.8) as canvas:
         _draw_tails(canvas.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))
-    return Drawing("ages", canvas.svg, label)
+    yield Drawing("ages", canvas.svg, label)
 
 
 def _draw_tails(ax: Axes, histograms: list[list[int]]) -> None:

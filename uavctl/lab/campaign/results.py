@@ -24,12 +24,11 @@ from logs.report.run_statistics import (
     step_rate,
 )
 from logs.report.statistics import replace_infinite
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.errors import RecordingError, UavctlError
 
 DOCUMENT, RUNS = "campaign.json", "runs.parquet"
 
-Values = Array
 
 _COUNT_COLUMNS = ("saturated", "decisions", "infeasible", "slack_used", "fallbacks")
 _FLOAT_COLUMNS = ("cost", "settled_cost", "mean_square_input", "largest_gap")
@@ -88,13 +87,13 @@ class CampaignRuns:
     """Runs of one cell that ended in order, sorted, and the errors of the others."""
 
     index: NDArray[np.int64]  # indices of the runs (N,)
-    figures: dict[str, Values]  # A value for each of them (N,), by column of the results
+    figures: dict[str, Array]  # A value for each of them (N,), by column of the results
     ages: NDArray[np.int64]  # number of steps at each age, over all of them
     # Runs with a state outside in each step 1, 2 …, up to the last one with any; tables of older versions have none
     outside: NDArray[np.int64]
     failed: tuple[tuple[int, str], ...]  # (run, error) of the others
 
-    def __getitem__(self, column: str) -> Values:
+    def __getitem__(self, column: str) -> Array:
         """Return a column (N,)."""
         return self.figures[column]
 
@@ -247,13 +246,13 @@ def _collect_runs(rows: pa.Table, cell: CellFigures) -> CampaignRuns:  # noqa: A
     )
 
 
-def _read_column(rows: pa.Table, name: str, is_complete: NDArray[np.bool_]) -> Values:
+def _read_column(rows: pa.Table, name: str, is_complete: Flags) -> Array:
     if name in _LATER_COLUMNS and name not in rows.column_names:
         return np.full(int(is_complete.sum()), np.nan)
     return np.asarray(rows[name].to_numpy()[is_complete], dtype=np.float64)
 
 
-def _sum_histograms(lists: pa.ChunkedArray, is_complete: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _sum_histograms(lists: pa.ChunkedArray, is_complete: Flags) -> NDArray[np.int64]:
     """Return the sum of histograms of any lengths."""
     column = lists.combine_chunks().filter(pa.array(is_complete))
     counts = column.flatten().to_numpy()

@@ -13,10 +13,9 @@ from itertools import product
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from uavctl import __version__
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.config import Config
 from uavctl.config.checks import get_position_index
 from uavctl.config.link import LinkConfig
@@ -182,7 +181,7 @@ def compute_path_figures(config: Config, states: Array) -> dict[str, Array]:
     }
 
 
-def _find_first_time_s(is_near: NDArray[np.bool_], dt_s: float) -> Array:
+def _find_first_time_s(is_near: Flags, dt_s: float) -> Array:
     """Return the time of the first step (N,) that is true [s]; infinite where there is none."""
     return np.where(is_near.any(axis=1), is_near.argmax(axis=1) * dt_s, np.inf)
 
@@ -299,7 +298,7 @@ def _compute_figures(task: Task, first: int, runs: int) -> Columns:
     return columns
 
 
-def _is_at_limit(task: Task, trajectories: Trajectories) -> NDArray[np.bool_]:
+def _is_at_limit(task: Task, trajectories: Trajectories) -> Flags:
     """Return the steps in which an input acted at its limit (N, T)."""
     sets = task.setting.base.sets
     low, high = np.array(sets.input_lower), np.array(sets.input_upper)

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from markupsafe import Markup
 
 from logs.recording.summary import count
-from logs.report import page
 from logs.report.excursion import GRAVE_M
-from logs.report.page import PageSection
+from logs.report.findings import Banner
+from logs.report.page import NOTHING, Part, Section, render_facts, render_list, render_page, render_table
+from uavctl.cause import BAD, CAUTION, GOOD
 from uavctl.lab.campaign.page import render_specification, write_html
 from uavctl.lab.campaign.trials import TrialRecord, TrialSummary, summarise_trial
-from uavctl.lab.trial import EXCESS_FIGURE, FIGURE_NOTE, SCENARIO_FIGURES
+from uavctl.lab.trial import EXCESS_FIGURE, FIGURE_NOTE, SCENARIO_FIGURES, Scenario
 
 _SCENARIO_TITLES = {
     "hold": "Flying to a place and holding it",
@@ -41,23 +44,31 @@ def write_trial_report(folder: Path) -> Path:
     return write_html(folder, render_trial_report(*summarise_trial(folder), render_specification(folder)))
 
 
-def render_trial_report(
-    record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup = page.NOTHING
-) -> str:
+def render_trial_report(record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup = NOTHING) -> str:
     """Return the page of a campaign of trials as HTML."""
     subtitle = f"{count(len(cells), 'cell')} · seed {record.master} · uavctl {record.uavctl_version}"
-    title, sections = f"Campaign “{record.name}”", _make_trial_sections(record, cells, specification)
-    return page.render_page(title, subtitle, _describe_trials(cells), sections, top=_render_trial_banner(cells))
+    view = _TrialView(record, cells, specification)
+    return render_page(f"Campaign “{record.name}”", subtitle, _SECTIONS, view, _judge_trials(cells))
 
 
-def _render_trial_banner(cells: Sequence[TrialSummary]) -> Markup:
-    """Return the banner as HTML: failed flights, else the largest distance of any flight beyond a wall."""
+class _TrialView(NamedTuple):
+    """What the page shows: the campaign, the figures of its cells, and its file as HTML."""
+
+    record: TrialRecord
+    cells: Sequence[TrialSummary]
+    specification: Markup
+
+    def find_cells(self, scenario: Scenario) -> list[TrialSummary]:
+        """Return the flown cells of a scenario."""
+        return [cell for cell in self.cells if cell.place.scenario == scenario and not cell.place.refused]
+
+
+def _judge_trials(cells: Sequence[TrialSummary]) -> Banner | None:
+    """Return the first line: failed flights, else the largest distance of any flight beyond a wall."""
     failed = sum(cell.failed for cell in cells)
     runs = sum(cell.runs for cell in cells)
     if failed:
-        return page.render_banner(
-            "bad", "Flights failed", f"{failed} of {count(runs, 'flight')}; they are in no figure.", ()
-        )
+        return Banner(BAD, "Flights failed", f"{failed} of {count(runs, 'flight')}; they are in no figure.")
     beyond = [
         (value, cell)
         for cell in cells
@@ -67,7 +78,7 @@ def _render_trial_banner(cells: Sequence[TrialSummary]) -> Markup:
         if math.isfinite(value)
     ]
     if not beyond:
-        return page.NOTHING
+        return None
     worst_m, worst = max(beyond, key=lambda value_and_cell: value_and_cell[0])
     place = worst.place
     description = f"{place.controller}, {_SCENARIO_TITLES[place.scenario].lower()}, {', '.join(_get_conditions(worst))}"
@@ -76,9 +87,9 @@ def _render_trial_banner(cells: Sequence[TrialSummary]) -> Markup:
         text = (
             f"{count(len(beyond), 'flight')}, of which the nearest to a wall had {-worst_m:.2f} m left ({description})."
         )
-        return page.render_banner("good", "All inside", text, ())
+        return Banner(GOOD, "All inside", text)
     text = f"{outside} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({description})."
-    return page.render_banner("bad" if worst_m >= GRAVE_M else "mind", "Left their limits", text, ())
+    return Banner(BAD if worst_m >= GRAVE_M else CAUTION, "Left their limits", text)
 
 
 def _describe_trials(cells: Sequence[TrialSummary]) -> Iterator[str]:
@@ -113,45 +124,58 @@ def _get_conditions(cell: TrialSummary) -> tuple[str, ...]:
     return place.autopilot, f"{place.rate_hz:g} Hz", place.link, place.air
 
 
-def _make_trial_sections(
-    record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup
-) -> Iterator[PageSection]:
-    rows = [
-        ("Flights of a cell", str(record.runs)),
-        ("Seed", f"{record.master}; flight i of every cell has the draws of (seed, i)"),
-    ]
-    rooms = {c.place.controller: c.place.usable_room for c in cells if c.place.usable_room is not None}
-    rows += [
-        (f"Usable room, {name}", f"{100 * share:.0f} % of it is where a plan may rest") for name, share in rooms.items()
-    ]
-    yield PageSection("What was compared", _OWN_LOOP_NOTE, page.render_facts(rows) + specification)
-    for number, (scenario, shown) in enumerate(SCENARIO_FIGURES.items()):
-        scenario_cells = [cell for cell in cells if cell.place.scenario == scenario and not cell.place.refused]
-        if not scenario_cells:
-            continue
-        columns = ("vehicle", "cameras", "link", "air", "controller", *(figure.heading for figure in shown), "ended in")
-        table = [
-            (
-                *(*_get_conditions(cell), cell.place.controller),
-                *(figure.format_values(cell.values[figure.key]) for figure in shown),
-                ", ".join(f"{mode} {number}" for mode, number in cell.modes.items()),
-            )
-            for cell in scenario_cells
+def _show_compared(view: _TrialView) -> Iterator[Part]:
+    record = view.record
+    rooms = {c.place.controller: c.place.usable_room for c in view.cells if c.place.usable_room is not None}
+    yield render_facts(
+        [
+            ("Flights of a cell", str(record.runs)),
+            ("Seed", f"{record.master}; flight i of every cell has the draws of (seed, i)"),
+            *(
+                (f"Usable room, {name}", f"{100 * share:.0f} % of it is where a plan may rest")
+                for name, share in rooms.items()
+            ),
         ]
-        body = page.render_table(columns, table, frozenset(range(5, 5 + len(shown))), kind="dense")
-        yield PageSection(_SCENARIO_TITLES[scenario], FIGURE_NOTE if number == 0 else "", body)
-    yield _make_trial_failures_section(cells)
+    )
+    yield view.specification
 
 
-def _make_trial_failures_section(cells: Sequence[TrialSummary]) -> PageSection:
+def _show_scenario(view: _TrialView, scenario: Scenario) -> Iterator[Part]:
+    """Return the figures of a scenario, a row for each cell."""
+    shown = SCENARIO_FIGURES[scenario]
+    columns = ("vehicle", "cameras", "link", "air", "controller", *(figure.heading for figure in shown), "ended in")
+    rows = [
+        (
+            *(*_get_conditions(cell), cell.place.controller),
+            *(figure.format_values(cell.values[figure.key]) for figure in shown),
+            ", ".join(f"{mode} {number}" for mode, number in cell.modes.items()),
+        )
+        for cell in view.find_cells(scenario)
+    ]
+    if rows:
+        yield render_table(columns, rows, frozenset(range(5, 5 + len(shown))), kind="dense")
+
+
+def _show_failures(view: _TrialView) -> Iterator[Part]:
     rows = [
         (str(cell.place.index), cell.place.controller, ", ".join(_get_conditions(cell)), reason)
-        for cell in cells
+        for cell in view.cells
         for reason in ([cell.place.refused] if cell.place.refused else cell.errors)
     ]
-    body = (
-        page.render_table(("cell", "controller", "where", "why"), rows, frozenset({0}))
-        if rows
-        else page.render_paragraph("None.")
-    )
-    return PageSection("Not flown, or failed", "", body)
+    if rows:
+        yield render_table(("cell", "controller", "where", "why"), rows, frozenset({0}))
+
+
+_SECTIONS: tuple[Section[_TrialView], ...] = (
+    Section("What happened", lambda view: [render_list(_describe_trials(view.cells))]),
+    Section("What was compared", _show_compared, note=_OWN_LOOP_NOTE),
+    *(
+        Section(
+            _SCENARIO_TITLES[scenario],
+            partial(_show_scenario, scenario=scenario),
+            note=FIGURE_NOTE if index == 0 else "",
+        )
+        for index, scenario in enumerate(SCENARIO_FIGURES)
+    ),
+    Section("Not flown, or failed", _show_failures, otherwise="None."),
+)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.lab.campaign.position_filter import PositionFilter
 from uavctl.smpc.batch import BatchController, Counts, Information
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-
-Flags = NDArray[np.bool_]
 
 _ROUNDING = 1e-9  # share of a limit; less is rounding
 

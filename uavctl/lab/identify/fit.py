@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.report.statistics import autocorrelation
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.errors import RecordingError
 from uavctl.lab.identify.history import MIN_SAMPLES, Stretch
 from uavctl.lab.identify.response import (
@@ -540,7 +540,7 @@ def compute_held_out_error(
     return HeldOutError(squares, counts)
 
 
-def _is_within(half: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> NDArray[np.bool_]:
+def _is_within(half: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> Flags:
     """Return whether one block of a half contains each time and also the time `ahead_s` later."""
     in_blocks = [(times_s >= block.begin_s) & (times_s + ahead_s <= block.end_s) for block in half]
     return np.asarray(np.logical_or.reduce(in_blocks), dtype=np.bool_)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import TlogPacket
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.config import Config
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSource
@@ -78,7 +78,7 @@ class SetpointHistory:
 
     times_s: Array  # (n,) [s]
     accel_mps2: Array  # (n, 3), north, east, down [m/s²]
-    is_flown: NDArray[np.bool_]  # (n,), whether the vehicle took setpoints then
+    is_flown: Flags  # (n,), whether the vehicle took setpoints then
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class Stretch:
     times_s: Array  # (m,), of capture [s]
     positions_m: Array  # (m, 3) [m]
     # (m,), whether a position counts when parameters are fitted; None is all
-    counts_for_fit: NDArray[np.bool_] | None = None
+    counts_for_fit: Flags | None = None
 
     @property
     def length_s(self) -> float:
@@ -152,7 +152,7 @@ def make_position_history(rows: Sequence[tuple[float, float, tuple[float, float,
     )
 
 
-def _is_plausible(positions_m: Array) -> NDArray[np.bool_]:
+def _is_plausible(positions_m: Array) -> Flags:
     """Return whether each position (m, 3) is near its neighbours' median, unlike swapped bodies and reflections."""
     if len(positions_m) < _NEIGHBOURS:
         return np.ones(len(positions_m), dtype=np.bool_)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from logs.report.page import PageSection, render_folded, render_grid, render_page, render_table
+from logs.report.page import Part, Section, render_folded, render_list, render_page, render_table
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
+from logs.report.verdict_figures import draw_correlation
 from uavctl.config.load import dump_config
-from uavctl.lab.identify.fit import LAGS, R2_AHEAD_S, Prediction
+from uavctl.lab.identify.fit import R2_AHEAD_S, Prediction
 from uavctl.lab.identify.history import PositionHistory
 from uavctl.lab.identify.result import Identification, Identified, describe_loss
 
@@ -27,20 +28,35 @@ def render_identify_page(identification: Identification, positions: PositionHist
         positions: Positions of the flight.
         source: Name of the recording on the page.
     """
-    result, link = identification.result, identification.link
-    sentences = [
-        f"{result.flown_s:.0f} s were flown under setpoints; {link.received} positions came, {link.lost} "
-        f"did not: {describe_loss(link)}.",
-        *(
-            f"{response.axis}: {100 * response.r2:.1f} % of the motion of the next {R2_AHEAD_S:g} s is predicted."
-            for response in result.response
-            # A warning on the prediction of an axis already reports it.
-            if not any(warning.startswith(f"{response.axis}: only ") for warning in result.warnings)
-        ),
-        *_describe_ramp(result),
-        *(f"{warning}." for warning in result.warnings),
-    ]
-    return render_page("Identified plant and link", source, sentences, _make_sections(identification, positions))
+    view = _IdentifyView(identification, positions)
+    return render_page("Identified plant and link", source, _SECTIONS, view)
+
+
+class _IdentifyView(NamedTuple):
+    """What the page shows: the fit, and the positions that it was made of."""
+
+    fit: Identification
+    positions: PositionHistory
+
+    @property
+    def axes(self) -> list[tuple[str, Prediction]]:
+        """Name and predictions of each axis."""
+        names = [response.axis for response in self.fit.result.response]
+        return list(zip(names, self.fit.predictions, strict=True))
+
+
+def _describe_fit(view: _IdentifyView) -> Iterator[str]:
+    result, link = view.fit.result, view.fit.link
+    yield (
+        f"{result.flown_s:.0f} s were flown under setpoints; {link.received} positions came, {link.lost} did not: "
+        f"{describe_loss(link)}."
+    )
+    for response in result.response:
+        # A warning on the prediction of an axis already reports it.
+        if not any(warning.startswith(f"{response.axis}: only ") for warning in result.warnings):
+            yield f"{response.axis}: {100 * response.r2:.1f} % of the motion of the next {R2_AHEAD_S:g} s is predicted."
+    yield from _describe_ramp(result)
+    yield from (f"{warning}." for warning in result.warnings)
 
 
 def _describe_ramp(result: Identified) -> Iterator[str]:
@@ -51,75 +67,13 @@ def _describe_ramp(result: Identified) -> Iterator[str]:
         )
 
 
-def _make_sections(identification: Identification, positions: PositionHistory) -> Iterator[PageSection]:
-    names = [response.axis for response in identification.result.response]
-    yield PageSection(
-        "Response",
-        _RESPONSE_NOTE,
-        render_table(_COLUMNS, _make_response_rows(identification), frozenset(range(1, len(_COLUMNS)))),
-    )
-    yield PageSection(
-        "Dead time and plant",
-        _DEAD_TIME_NOTE,
-        _render_candidates(identification) + render_grid([_draw_deviance(identification)]),
-    )
-    drawings = [
-        _draw_motion(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
-    ]
-    yield PageSection(f"Motion of the next {R2_AHEAD_S:g} s", _MOTION_NOTE, render_grid(drawings))
-    yield PageSection(
-        "Spread ahead",
-        _SPREAD_NOTE,
-        render_table(
-            _SPREAD_COLUMNS, _make_spread_rows(identification), frozenset(range(1, len(_SPREAD_COLUMNS))), kind="words"
-        ),
-    )
-    innovation_drawings = [
-        _draw_innovations(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
-    ]
-    correlation_drawings = [
-        _draw_correlation(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
-    ]
-    yield PageSection(
-        "What is left unexplained",
-        _RESIDUAL_NOTE,
-        render_grid(
-            [drawing for pair in zip(innovation_drawings, correlation_drawings, strict=True) for drawing in pair]
-        ),
-    )
-    yield PageSection("Link", _LINK_NOTE, render_grid([_draw_delays(positions), _draw_loss_runs(identification)]))
-    yield PageSection(
-        "Configuration", "", render_folded("TOML with what was identified", dump_config(identification.config))
-    )
-
-
 _COLUMNS = ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "noise [mm]", "R²")
-_RESPONSE_NOTE = (
-    "With the dead time below, one for all axes. ± is the standard error with that dead time. The wind is the standard "
-    "deviation of an acceleration that is constant over a step."
-)
-_DEAD_TIME_NOTE = (
-    "The dead time is the likeliest for the whole flight and all axes, its range where the deviance is less than 4 "
-    "above its least. The errors compare plants: fitted to one half of the flight and judged by the other, blocks of "
-    "8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints known."
-)
 _SPREAD_COLUMNS = ("axis", "time ahead [s]", "σ [mm]", "spread", "spread by the configuration before")
-_SPREAD_NOTE = (
-    "How far positions were from their predictions over that time, divided by the standard deviation σ that plans keep "
-    "multiples of: 1 is right, above 1 plans come too near to limits. By the identified configuration, and by the one "
-    "before; both without inertial data."
-)
-_RESIDUAL_NOTE = (
-    "Each position minus its prediction from those before: with a right model, 95 % are between the lines, and "
-    "one does not tell the next (bars between the lines)."
-)
-_LINK_NOTE = "Delays by capture stamps and arrival; runs of losses (bars) beside those of independent losses (dots)."
-_MOTION_NOTE = "Each dot is a position: how far the vehicle went from there, and how far the model said it would."
 
 
-def _make_response_rows(identification: Identification) -> Iterator[tuple[str, ...]]:
-    for response in identification.result.response:
-        yield (
+def _show_response(view: _IdentifyView) -> Iterator[Part]:
+    rows = [
+        (
             response.axis,
             _format_with_error(response.lag_s, response.lag_std_s),
             _format_with_error(response.drag_1ps, response.drag_std_1ps),
@@ -128,16 +82,27 @@ def _make_response_rows(identification: Identification) -> Iterator[tuple[str, .
             f"{response.position_std_m * 1e3:.1f}",
             f"{response.r2:.3f}",
         )
+        for response in view.fit.result.response
+    ]
+    yield render_table(_COLUMNS, rows, frozenset(range(1, len(_COLUMNS))))
 
 
-def _make_spread_rows(identification: Identification) -> Iterator[tuple[str, ...]]:
-    for row in identification.result.spreads:
-        configured = "–" if row.configured is None else f"{row.configured:.2f}"
-        yield row.axis, f"{row.ahead_s:g}", f"{1e3 * row.std_m:.1f}", f"{row.spread:.2f}", configured
+def _show_spread(view: _IdentifyView) -> Iterator[Part]:
+    rows = [
+        (
+            row.axis,
+            f"{row.ahead_s:g}",
+            f"{1e3 * row.std_m:.1f}",
+            f"{row.spread:.2f}",
+            "–" if row.configured is None else f"{row.configured:.2f}",
+        )
+        for row in view.fit.result.spreads
+    ]
+    yield render_table(_SPREAD_COLUMNS, rows, frozenset(range(1, len(_SPREAD_COLUMNS))), kind="words")
 
 
-def _render_candidates(identification: Identification) -> Markup:
-    candidates = identification.result.candidates
+def _show_dead_time(view: _IdentifyView) -> Iterator[Part]:
+    candidates = view.fit.result.candidates
     ahead = [f"{time_s:g} s on [mm]" for time_s in candidates[0].ahead_s]
     rows = [
         (
@@ -148,13 +113,27 @@ def _render_candidates(identification: Identification) -> Markup:
             *(f"{1e3 * value:.1f}" for value in errors),
         )
         for candidate in candidates
-        for response, lag_s, errors in zip(
-            identification.result.response, candidate.lag_s, candidate.rms_m, strict=True
-        )
+        for response, lag_s, errors in zip(view.fit.result.response, candidate.lag_s, candidate.rms_m, strict=True)
     ]
     columns = ("plant", "dead time [s]", "axis", "lag [s]", *ahead)
     # Names of axes are no paths: they stay whole, and the columns are as wide as they need.
-    return render_table(columns, rows, frozenset(range(3, len(columns))), kind="words")
+    yield render_table(columns, rows, frozenset(range(3, len(columns))), kind="words")
+    yield _draw_deviance(view.fit)
+
+
+def _draw_residuals(view: _IdentifyView) -> Iterator[Part]:
+    for name, prediction in view.axes:
+        yield _draw_innovations(name, prediction)
+        bound = 1.96 / np.sqrt(max(len(prediction.innovations_m), 1))  # 95 % of the correlations of white noise
+        outside = int(np.count_nonzero(np.abs(prediction.correlation) > bound))
+        total = len(prediction.correlation)
+        label = f"{name}: {outside} of {total} correlations are outside the 95 % band of white noise"
+        yield draw_correlation(name, prediction.correlation, bound, label)
+
+
+def _draw_link(view: _IdentifyView) -> Iterator[Part]:
+    yield _draw_delays(view.positions)
+    yield _draw_loss_runs(view.fit)
 
 
 def _draw_deviance(identification: Identification) -> Drawing:
@@ -197,21 +176,6 @@ def _draw_innovations(name: str, prediction: Prediction) -> Drawing:
     return Drawing(f"innovations-{name}", canvas.svg, label)
 
 
-def _draw_correlation(name: str, prediction: Prediction) -> Drawing:
-    lags = np.arange(1, len(prediction.correlation) + 1)
-    band = 1.96 / np.sqrt(max(len(prediction.innovations_m), 1))
-    with open_canvas(f"white-{name}", _HEIGHT_IN) as canvas:
-        ax = canvas.axes(f"{name}: correlation of innovations", "positions apart", "correlation")
-        ax.bar(lags, prediction.correlation, color=colour("estimate"), width=0.6)
-        for sign in (-band, band):
-            ax.axhline(sign, color=colour("limit"), linewidth=0.8)
-        ax.set_xlim(0, LAGS + 1)
-        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    outside = int(np.count_nonzero(np.abs(prediction.correlation) > band))
-    label = f"{name}: {outside} of {len(lags)} correlations are outside the 95 % band of white noise"
-    return Drawing(f"white-{name}", canvas.svg, label)
-
-
 def _draw_delays(positions: PositionHistory) -> Drawing:
     with open_canvas("delays", _HEIGHT_IN) as canvas:
         ax = canvas.axes("Delay from capture to arrival", "time [s]", "delay [ms]")
@@ -237,3 +201,48 @@ def _draw_loss_runs(identification: Identification) -> Drawing:
     return Drawing(
         "runs", canvas.svg, "share of the runs of losses as measured (bars) and as independent losses make them"
     )
+
+
+_SECTIONS: tuple[Section[_IdentifyView], ...] = (
+    Section("What happened", lambda view: [render_list(_describe_fit(view))]),
+    Section(
+        "Response",
+        _show_response,
+        note="With the dead time below, one for all axes. ± is the standard error with that dead time. The wind is the "
+        "standard deviation of an acceleration that is constant over a step.",
+    ),
+    Section(
+        "Dead time and plant",
+        _show_dead_time,
+        note="The dead time is the likeliest for the whole flight and all axes, its range where the deviance is less "
+        "than 4 above its least. The errors compare plants: fitted to one half of the flight and judged by the other, "
+        "blocks of 8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints "
+        "known.",
+    ),
+    Section(
+        f"Motion of the next {R2_AHEAD_S:g} s",
+        lambda view: (_draw_motion(name, prediction) for name, prediction in view.axes),
+        note="Each dot is a position: how far the vehicle went from there, and how far the model said it would.",
+    ),
+    Section(
+        "Spread ahead",
+        _show_spread,
+        note="How far positions were from their predictions over that time, divided by the standard deviation σ that "
+        "plans keep multiples of: 1 is right, above 1 plans come too near to limits. By the identified configuration, "
+        "and by the one before; both without inertial data.",
+    ),
+    Section(
+        "What is left unexplained",
+        _draw_residuals,
+        note="Each position minus its prediction from those before: with a right model, 95 % are between the lines, "
+        "and one does not tell the next (correlations within the band).",
+    ),
+    Section(
+        "Link",
+        _draw_link,
+        note="Delays by capture stamps and arrival; runs of losses (bars) beside those of independent losses (dots).",
+    ),
+    Section(
+        "Configuration", lambda view: [render_folded("TOML with what was identified", dump_config(view.fit.config))]
+    ),
+)

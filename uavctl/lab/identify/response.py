@@ -29,7 +29,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Flags
 from uavctl.lab.identify.history import Stretch
 
 DRAG_LAG, VELOCITY_REFERENCE = "drag-lag", "velocity-reference"
@@ -238,7 +238,7 @@ class Timeline:
     inputs_mps2: Array  # (n, axes), constant in each [m/s²]
     measured: Counts  # (m,), the segment at whose end each position was captured
     positions_m: Array  # (m, axes) [m]
-    counts_for_fit: NDArray[np.bool_]  # (m,), whether each counts for the likelihood; the filter uses all
+    counts_for_fit: Flags  # (m,), whether each counts for the likelihood; the filter uses all
 
     @cached_property
     def captured(self) -> Counts:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.report.statistics import replace_infinite
+from uavctl.arrays import Flags
 from uavctl.config import Config
 from uavctl.config.link import MAX_LOSS_RUN
 from uavctl.errors import RecordingError
@@ -104,7 +105,7 @@ def describe_loss(link: LinkFit) -> str:
     return f"{text}; outages: {outages}"
 
 
-def _find_outages(missing: NDArray[np.int64], rate_hz: float) -> NDArray[np.bool_]:
+def _find_outages(missing: NDArray[np.int64], rate_hz: float) -> Flags:
     """Return which runs of losses are longer than a geometric distribution of the others explains."""
     is_outage = np.zeros(len(missing), dtype=np.bool_)
     for index in np.argsort(missing)[::-1].tolist():

@@ -11,14 +11,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, NullLocator
-from numpy.typing import NDArray
 
 from logs.report.svg import choose_ramp_colour, colour, make_standalone, open_canvas
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Counts
 from uavctl.lab.paper.runs import LIKELIHOOD, compute_ellipsoid_scale, get_axis_planes
 from uavctl.smpc.hahn_stursberg.design import Design
-
-Counts = NDArray[np.intp]
 
 _WIDTH_IN, _HEIGHT_IN = 10.0, 3.9
 # Fixed margins avoid a second drawing that would measure them.

@@ -17,10 +17,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from logs.report.statistics import chi2_quantile
-from uavctl.arrays import Array
+from uavctl.arrays import Array, Counts, Flags
 from uavctl.config import Config
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
@@ -138,8 +137,6 @@ def get_axis_planes(plant: Plant) -> Sequence[tuple[int, int]]:
     """Return the state indices (position, velocity) of each axis."""
     return list(zip(plant.position_index, plant.velocity_index, strict=True))
 
-
-Counts = NDArray[np.intp]
 
 LIKELIHOOD = 0.95  # of the ellipsoid that the paper draws
 
@@ -261,7 +258,7 @@ def compute_ellipsoid_scale(design: Design) -> float:
     return chi2_quantile(LIKELIHOOD, design.plant.n_x)
 
 
-def is_in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
+def is_in_ellipsoid(states: Array, design: Design) -> Flags:
     """Return which states (…, n_x) are in the 95 % ellipsoid of Σ_ξ's block of a single state."""
     root = np.linalg.cholesky(design.terminal.sigma_x)
     whitened = np.linalg.solve(root, (states - design.target).reshape(-1, design.plant.n_x).T)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -17,9 +17,8 @@ from logs.recording.flight import FlightData
 from logs.recording.notes import RecorderNote
 from logs.recording.summary import FlightSummary, list_summary_rows
 from logs.recording.topics import encode
-from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
-from logs.report.plots import DASHED, DOTTED, draw_limits
-from logs.report.svg import Drawing, colour, open_canvas
+from logs.report import overlays
+from logs.report.page import Mark, Section, render_list, render_page, render_table
 from sim.vehicle.linear import CACHED_TRANSITIONS
 from uavctl.arrays import Array
 from uavctl.lab.whatif.flight import Entry, RecordedFlight, VehicleResponse
@@ -186,28 +185,9 @@ def _compute_max_difference(both: Iterable[dict[int, tuple[float, ...]]]) -> flo
     return max(map(float, differences), default=0.0)
 
 
-_HEIGHT_IN = 2.6
-RECORDED_ROLE, WHAT_IF_ROLE = "truth", "plan"  # roles of the colours
 HEADINGS = ("", "recorded", "reproduced", "what-if")
 _COMPUTER_ROWS = ("Decision time", "Clock", "Tick lateness")  # depend on the computer
 _MIN_DROPPED_SHARE = 0.01  # of the inertial messages; a few are always older than the first attitude, or late
-_MARKS = (
-    Mark("line", RECORDED_ROLE, "recorded"),
-    Mark("line", WHAT_IF_ROLE, "what-if"),
-    Mark("dotted", "target", "target"),
-    Mark("dashed", "limit", "limit"),
-    Mark("band", "limit", "reserve kept"),
-)
-_VALIDITY_NOTE = (
-    "The recorded flight flown again with nothing changed tells whether this version decides as the one that flew. "
-    "How far the model goes wrong within a second is what the what-if column cannot know: the same happens to it, "
-    "counted as disturbance."
-)
-_MOTION_NOTE = (
-    "Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits and the "
-    "band along them, the largest reserve that the plan of the moment kept, are those of the what-if."
-)
-_AGE_NOTE = "Age of the newest position at each decision: a link that loses more, or later positions, is higher."
 
 
 def render_what_if_page(what_if: WhatIf, recorded: FlightData, other: FlightData) -> str:
@@ -216,7 +196,7 @@ def render_what_if_page(what_if: WhatIf, recorded: FlightData, other: FlightData
     Args:
         recorded: The recorded flight, cut to the compared part.
     """
-    return render_page("What if", what_if.flight, describe_what_if(what_if), _make_sections(what_if, recorded, other))
+    return render_page("What if", what_if.flight, _SECTIONS, _WhatIfView(what_if, recorded, other))
 
 
 def describe_what_if(what_if: WhatIf) -> list[str]:
@@ -259,35 +239,57 @@ def make_comparison_rows(what_if: WhatIf) -> Iterator[tuple[str, ...]]:
             yield (name, *(column.get(name, "-") for column in columns))
 
 
-def _make_sections(what_if: WhatIf, recorded: FlightData, other: FlightData) -> Iterator[PageSection]:
-    indices = recorded.design.position_index
-    axes = [_draw_axis(recorded, other, index, name) for index, name in zip(indices, recorded.design.axes, strict=True)]
-    yield PageSection("Motion", _MOTION_NOTE, render_grid(axes), _MARKS)
-    horizon = Mark("dashed", "limit", f"horizon H = {other.design.horizon}")
-    yield PageSection("Link", _AGE_NOTE, render_grid([_draw_ages(recorded, other)]), (*_MARKS[:2], horizon))
-    yield PageSection(
-        "Side by side", _VALIDITY_NOTE, render_table(HEADINGS, make_comparison_rows(what_if), frozenset())
+class _WhatIfView(NamedTuple):
+    """What the page shows: the result, and both flights cut to the compared part."""
+
+    result: WhatIf
+    recorded: FlightData
+    other: FlightData
+
+    @property
+    def flights(self) -> tuple[FlightData, FlightData]:
+        """Both flights."""
+        return self.recorded, self.other
+
+
+def _explain_ages(view: _WhatIfView) -> str:
+    return (
+        f"Age of the newest position at each decision; its plans last H = {view.other.design.horizon} steps. "
+        "A link that loses more, or later positions, is higher."
     )
 
 
-def _draw_axis(recorded: FlightData, other: FlightData, index: int, name: str) -> Drawing:
-    with open_canvas(f"motion-{name}", _HEIGHT_IN) as canvas:
-        ax = canvas.axes(name, "time [s]", "position [m]")
-        draw_limits(ax, other, index, 1.0)
-        for flight, role in ((recorded, RECORDED_ROLE), (other, WHAT_IF_ROLE)):
-            steps = flight.steps
-            ax.plot(steps.t_s, steps.state[:, index], color=colour(role))
-        ax.plot(other.steps.t_s, other.steps.target[:, index], color=colour("target"), ls=DOTTED, lw=1.1)
-    label = f"position {name} of the recorded flight and of the other over time, against the limits of the other"
-    return Drawing(f"motion-{name}", canvas.svg, label)
-
-
-def _draw_ages(recorded: FlightData, other: FlightData) -> Drawing:
-    with open_canvas("ages", _HEIGHT_IN) as canvas:
-        ax = canvas.axes("Age of the newest position", "time [s]", "steps")
-        for flight, role in ((recorded, RECORDED_ROLE), (other, WHAT_IF_ROLE)):
-            steps = flight.steps
-            ages = np.array([np.nan if d.age_steps is None else d.age_steps for d in steps.decisions])
-            ax.plot(steps.t_s, ages, color=colour(role), drawstyle="steps-post")
-        ax.axhline(other.design.horizon, color=colour("limit"), lw=1.2, ls=DASHED)
-    return Drawing("ages", canvas.svg, "age of the newest position at each decision of both flights, and the horizon")
+_BOTH = tuple(Mark("line", role, name) for role, name in zip(overlays.ROLES, ("recorded", "what-if"), strict=False))
+_SECTIONS: tuple[Section[_WhatIfView], ...] = (
+    Section("What happened", lambda view: [render_list(describe_what_if(view.result))]),
+    Section(
+        "Path",
+        lambda view: overlays.draw_paths(view.flights),
+        legend=(*_BOTH, Mark("dashed", "limit", "limit of the recorded flight")),
+    ),
+    Section(
+        "Motion",
+        lambda view: overlays.draw_positions(view.flights, view.other),
+        note="Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits "
+        "and the band along them, the largest reserve that the plan of the moment kept, are those of the what-if.",
+        legend=(
+            *_BOTH,
+            Mark("dotted", "target", "target"),
+            Mark("dashed", "limit", "limit"),
+            Mark("band", "limit", "reserve kept"),
+        ),
+    ),
+    Section(
+        "Link",
+        lambda view: [overlays.draw_ages(view.flights)],
+        note=_explain_ages,
+        legend=(*_BOTH, Mark("dotted", "muted", "horizon H")),
+    ),
+    Section(
+        "Side by side",
+        lambda view: [render_table(HEADINGS, make_comparison_rows(view.result), frozenset())],
+        note="The recorded flight flown again with nothing changed tells whether this version decides as the one that "
+        "flew. How far the model goes wrong within a second is what the what-if column cannot know: the same happens "
+        "to it, counted as disturbance.",
+    ),
+)

@@ -1,4 +1,4 @@
-"""The page's words on how a flight ended: by the operator, by the fallback, or cut off."""
+"""Facts of a flight by its records: cause of its end, fallbacks, delays, predicted places, orders."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ import dataclasses
 import msgspec
 import numpy as np
 import pytest
-from report_rig import read_page_text
 from synthetic_flight import fly
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import Percentiles, describe_prediction, list_summary_rows, summarise
-from logs.report.summary_text import describe_flight
+from logs.recording.summary import describe_prediction, list_summary_rows, summarise
+from logs.report.evidence import FlightEvidence
+from logs.report.headline import derive_headline
+from logs.report.verdict_link import judge_link
+from logs.report.verdicts import judge_flight
+from uavctl.cause import Cause
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
 from uavctl.event_codes import MISSION, EventCode
@@ -23,13 +26,13 @@ from uavctl.records import ControlMode, Decision, Event, LinkStats, Order, Recor
 TICK_S = room().tick_s
 
 
-def ended_in(
+def make_flight(
     modes: dict[int, ControlMode],
     stop_tick: int | None = None,
     order_tick: int | None = None,
     due_tick: int | None = None,
-) -> str:
-    """Text of the page of a 4 s flight (ticks of 50 ms) whose modes change at the given ticks.
+) -> FlightData:
+    """A 4 s flight (ticks of 50 ms) whose modes change at the given ticks.
 
     The operator stops it at `stop_tick`, or orders the landing at `order_tick`; the mission is over at `due_tick`.
     """
@@ -51,78 +54,46 @@ def ended_in(
         if at_ns is not None:
             event = Event(at_ns=at_ns, severity=Severity.INFO, code=code, text="", subject=subject)
             items.append(("/uavctl/event", at_ns, event))
-    return " ".join(read_page_text(FlightData.from_records(items)).text)
+    return FlightData.from_records(items)
 
 
 HAND_OVER = {40: ControlMode.BRAKE, 50: ControlMode.HOLD, 51: ControlMode.LAND, 52: ControlMode.STOPPED}
+FALLBACK_BEFORE = {20: ControlMode.BRAKE, 24: ControlMode.TRACK, **HAND_OVER}
 
 
-def test_the_operators_stop_is_no_fallback() -> None:
-    text = ended_in(HAND_OVER, stop_tick=40)
-    assert f"Ended by the operator after {40 * TICK_S:g} s" in text
-    assert "handed over to its own landing" in text
-    assert "took over" not in text
-
-
-def test_a_fallback_before_the_operators_stop_is_told() -> None:
-    text = ended_in({20: ControlMode.BRAKE, 24: ControlMode.TRACK, **HAND_OVER}, stop_tick=40)
-    assert f"took over once, for {4 * TICK_S:g} s in all; at {20 * TICK_S:g} s: why not" in text
-    assert "Ended by the operator" in text
-
-
-def test_a_hand_over_that_was_cut_off_is_told() -> None:
-    cut_off = "recording ends before"
-    assert cut_off in ended_in({40: ControlMode.BRAKE}, stop_tick=40)
-    whole = ended_in({40: ControlMode.STOPPED}, stop_tick=40)
-    assert "the vehicle was handed over" in whole and cut_off not in whole
-
-
-def test_a_landing_is_told() -> None:
-    text = ended_in(HAND_OVER)
-    assert f"Landed by the fallback after {51 * TICK_S:g} s" in text
-    assert f"(brake, hold, land) took over once, for {12 * TICK_S:g} s" in text
-    assert "operator" not in text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("ordered", "told"), [(True, "Landed as ordered"), (False, "end of the mission")])
-def test_a_landing_that_was_wanted_is_told_as_such(ordered: bool, told: str) -> None:
-    text = ended_in(HAND_OVER, order_tick=40 if ordered else None, due_tick=None if ordered else 40)
-    assert told in text and f"{51 * TICK_S:g} s" in text
-    assert "took over" not in text
-    assert "fallback had the vehicle land" not in text and "by the fallback" not in text
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("mode", "told"),
+    ("flight", "cause", "fallbacks"),
     [
-        (ControlMode.WAIT, "waiting: why not."),  # with its reason
-        (ControlMode.TRACK, "a plan was being flown"),
-        (ControlMode.HOLD, "held zero acceleration"),
+        (make_flight(HAND_OVER, stop_tick=40), Cause.ENDED_BY_OPERATOR, 0),
+        (make_flight(FALLBACK_BEFORE, stop_tick=40), Cause.ENDED_BY_OPERATOR, 1),
+        (make_flight({40: ControlMode.STOPPED}, stop_tick=40), Cause.ENDED_BY_OPERATOR, 0),
+        (make_flight(HAND_OVER), Cause.FALLBACK_LANDED, 1),
+        (make_flight(HAND_OVER, order_tick=40), Cause.LANDED_AS_ORDERED, 0),
+        (make_flight(HAND_OVER, due_tick=40), Cause.LANDED_AFTER_MISSION, 0),
+        (make_flight({40: ControlMode.WAIT}), Cause.WAITING, 0),
+        (make_flight({40: ControlMode.TRACK}), Cause.IN_FLIGHT, 0),
+        (make_flight({40: ControlMode.HOLD}), Cause.IN_FLIGHT, 1),
     ],
 )
-def test_a_recording_that_ends_otherwise(mode: ControlMode, told: str) -> None:
-    assert told in ended_in({40: mode})
+def test_a_recording_without_an_ending_tells_its_cause_and_its_fallbacks(
+    flight: FlightData, cause: Cause, fallbacks: int
+) -> None:
+    summary = summarise(flight, wall_s=1.0)
+    assert (summary.ending.code, summary.fallbacks) == (cause, fallbacks)
 
 
-def test_a_simulated_flight_that_never_began_has_a_page() -> None:
-    nothing = "Nothing was flown: why not."  # with its reason
-    assert nothing in " ".join(ended_in({0: ControlMode.WAIT}).split())
-    assert nothing in " ".join(ended_in({0: ControlMode.STOPPED}, stop_tick=0).split())
+def test_the_fallback_before_the_operators_stop_has_its_span() -> None:
+    assert make_flight(FALLBACK_BEFORE, stop_tick=40).fallback_spans == [pytest.approx((20 * TICK_S, 24 * TICK_S))]
 
 
-def test_what_went_amiss_is_in_the_table_alone() -> None:
-    flight = FlightData.from_records(fly(room(), 4.0))
-    good = summarise(flight, wall_s=1.0)
-    times = Percentiles(p50=100.0, p99=900.0, max=73_400.0)
-    bad = msgspec.structs.replace(good, missed_ticks=3, tick_lateness_us=times, recorder_dropped=1)
-    assert describe_flight(flight, bad) == describe_flight(flight, good)
-    cells = " ".join(text for _, text in list_summary_rows(bad))
-    assert "73.4 ms" in cells and "3 ticks" in cells and "1 record " in cells
+@pytest.mark.parametrize(
+    "flight", [make_flight({0: ControlMode.WAIT}), make_flight({0: ControlMode.STOPPED}, stop_tick=0)]
+)
+def test_a_flight_that_never_began_is_not_flown(flight: FlightData) -> None:
+    evidence = FlightEvidence(flight, summarise(flight, wall_s=1.0), judge_flight(flight))
+    assert evidence.summary.steps == 0 and derive_headline(evidence).cause is Cause.NOT_FLOWN
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("latency_s", [0.0, 0.03])
 def test_the_shortest_delay_is_what_the_configuration_takes_it_to_be(latency_s: float) -> None:
     config = load_config("room-hahn-stursberg", (f"clock.latency_s={latency_s}",))
@@ -140,19 +111,9 @@ def test_the_shortest_delay_is_what_the_configuration_takes_it_to_be(latency_s: 
         clock_drift_ppm=None,
         clock_rejected=0,
     )
-    text = " ".join(read_page_text(dataclasses.replace(found, links=(stats,))).text)
-    taken = "30 ms (clock.latency_s)" in text
-    short = "short of the quickest" in text
-    assert (taken, short) == (latency_s > 0.0, latency_s == 0.0)
-
-
-def test_the_ways_to_a_plan_and_slack_are_explained_where_they_stand() -> None:
-    found = FlightData.from_records(fly(room(), 4.0))
-    ways = ("frozen", "mixture", "exact")
-    plans = tuple(msgspec.structs.replace(plan, method=ways[at % 2]) for at, plan in enumerate(found.plans))
-    text = " ".join(read_page_text(dataclasses.replace(found, plans=plans)).text)
-    assert [f"“{way}”: with " in text for way in ways] == [True, True, False]
-    assert "Slack is" in text
+    delay = judge_link(dataclasses.replace(found, links=(stats,)), config).delay
+    assert delay is not None and delay.from_quickest
+    assert delay.latency_ms == pytest.approx(1e3 * latency_s)
 
 
 def flown_blind(age_s: float, *, truth: bool = False) -> FlightData:
@@ -206,9 +167,6 @@ def test_a_place_that_was_ordered_is_no_trajectory() -> None:
     summary = summarise(flight, wall_s=1.0)
     assert not summary.trajectory
     assert [target[0] for _, target in flight.ordered_places] == [-0.7]
-    text = " ".join(describe_flight(flight, summary))
-    assert "trajectory" not in text and "(-0.7, " in text
-    assert not any("trajectory" in name for name, _ in list_summary_rows(summary))
 
 
 def test_waypoints_alone_are_no_orders_and_a_target_that_moves_is_a_trajectory() -> None:
@@ -222,4 +180,3 @@ def test_waypoints_alone_are_no_orders_and_a_target_that_moves_is_a_trajectory()
 
     flight = FlightData.from_records([(t, at, moving(r)) for t, at, r in fly(room(), 4.0)])
     assert flight.moving_target and flight.ordered_places == ()
-    assert "trajectory" in " ".join(describe_flight(flight, summarise(flight, wall_s=1.0)))
