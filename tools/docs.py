@@ -26,7 +26,7 @@ from uavctl.records import Record
 ROOT = Path(__file__).resolve().parent.parent
 _CONFIGURATION = """# Configuration
 
-This page is generated from the types in `uavctl/config/` (`make docs`); do not edit it.
+This page lists every key. It is generated from `uavctl/config/` (`make docs`); do not edit it.
 
 A configuration is a TOML file. The shortest one names a preset and overrides some keys:
 
@@ -37,20 +37,16 @@ base = "room-px4"
 north_m = [-2.0, 2.0]
 ```
 
-`--config NAME` takes a file or a preset: `paper`, `room`, `room-px4`, `room-ardupilot` or `room-hahn-stursberg`
-(complete examples in `uavctl/presets/`). `--set key.path=value` overrides any key and may be repeated, as in
-`--set link.loss=0.3` or `--set 'link.blackout=[[20, 40]]'`. A string needs no quotes.
-
-* `base` gives all keys that the file lacks. `[room]` then gives the limits by name instead of the lists of `[sets]`
-  and `[target]`. `uavctl init` writes such a file.
-* Without `base` a file needs `[plant]`, `[sets]` and `[cost]`. Other keys have a default, or follow from these.
-* All problems are reported at once, each with file, line, key and remedy (exit code 2). Each number has a range
-  (1e7 at most if none is given), and every text and list a longest length.
-* States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model
-  `velocity-reference` has besides: acceleration, lead of the vehicle's reference in position and velocity, integral.
-* n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
-* A plant of `matrices` without `axes` has no place in a room. `solve`, `design`, `campaign` and `uavctl.simulate`
-  take it.
+* `--config NAME` takes a file or a preset: `paper`, `room`, `room-px4`, `room-ardupilot` or `room-hahn-stursberg` (in `uavctl/presets/`).
+* `--set key.path=value` overrides any key and may be repeated: `--set link.loss=0.3`, `--set 'link.blackout=[[20, 40]]'`. A string needs
+  no quotes.
+* `base` gives the keys that the file lacks. Then `[room]` may replace the lists of `[sets]` and `[target]`. `uavctl init` writes such a file.
+* Without `base` a file needs `[plant]`, `[sets]` and `[cost]`. Other keys have defaults or follow from these.
+* All problems are reported at once, with file, line, key and remedy (exit code 2). Numbers without a range here are -1e7 to 1e7.
+* States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model `velocity-reference` adds acceleration,
+  lead of the vehicle's reference in position and velocity, and integral.
+* n_x, n_u and n_w are the numbers of states, inputs (one for each axis) and disturbances. H is the horizon, Δt the step.
+* A plant of `matrices` without `axes` cannot fly. `solve`, `design`, `campaign` and `uavctl.simulate` take it.
 """
 # Keys that follow from others where they are left out.
 _DERIVED = {
@@ -93,7 +89,7 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
         if not is_section(field.type):
             needed = f"{path}.{field.encode_name}" in HAHN_STURSBERG_KEYS
             default = "required with scheme `hahn-stursberg`" if needed else _default(field, section, path)
-            cells = (f"`{field.encode_name}`", describe_type(field.type), get_description(field), default)
+            cells = (f"`{field.encode_name}`", _describe_type(field), get_description(field), default)
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
     for field in fields:
@@ -103,6 +99,14 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
             yield from tables(one, f"[{name}]")
         elif is_section(field.type):
             yield from tables(field.type, name)
+
+
+def _describe_type(field: FieldInfo) -> str:
+    """Describe a type in few words: without the largest lengths and the ranges that the head of the page states."""
+    text = re.sub(r" \((entries|characters): at most \d+\)| \(>= -1e7, <= 1e7\)", "", describe_type(field.type))
+    text = re.sub(r"\(>= (\S+), <= (\S+)\)", r"(\1 to \2)", text)
+    text = text.replace('" or "', '", "').replace("whole number", "integer").replace("true or false", "boolean")
+    return text.replace("list of lists", "lists").replace("list of ", "")
 
 
 def _default(field: FieldInfo, section: type[Section], path: str) -> str:

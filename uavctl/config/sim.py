@@ -88,11 +88,11 @@ class ChecksConfig(Section, frozen=True, kw_only=True):
             length=MAX_SPANS,
         ),
     ] = ()
-    clears: Annotated[bool, declare("whether a failsafe for want of a position ends with its cause, as in PX4")] = False
+    clears: Annotated[bool, declare("whether a failsafe without a position ends with its cause, as in PX4")] = False
 
 
 class FaultConfig(Section, frozen=True, kw_only=True):
-    """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
+    """A fault of the simulated flight at a given time; `uavctl sim --faults FILE` reads a list of them."""
 
     at_s: Annotated[float, declare("when, since the start", "s", 0, MAX_DURATION_S)]
     kind: Annotated[

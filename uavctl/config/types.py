@@ -150,7 +150,7 @@ Likelihood = Annotated[float, Meta(gt=0, lt=1)] | None
 
 
 class SmpcConfig(Section, frozen=True, kw_only=True):
-    """The predictive controller; scheme `age-conditioned` passes over what only the other one asks for."""
+    """The predictive controller; scheme `age-conditioned` ignores keys of the other one."""
 
     scheme: Annotated[
         Scheme,
@@ -192,7 +192,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
 
 
 class ScheduleConfig(Section, frozen=True, kw_only=True):
-    """Information delays d_t: what feedback may be counted on in stage t."""
+    """Information delays d_t: the age of the feedback that stage t counts on."""
 
     rule: Annotated[
         Literal["fixed", "search", "greedy"],
