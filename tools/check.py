@@ -96,7 +96,13 @@ def check_wheel() -> str:
 def check_site() -> str:
     """Build the site of the manual; a page, link or heading that is missing is an error."""
     with tempfile.TemporaryDirectory(prefix="uavctl-site-") as folder:
-        command = [BIN / "mkdocs", "build", "--strict", "--config-file", ROOT / "tools" / "mkdocs.yml"]
+        command: list[str | Path] = [
+            BIN / "mkdocs",
+            "build",
+            "--strict",
+            "--config-file",
+            ROOT / "tools" / "mkdocs.yml",
+        ]
         return run([*command, "--site-dir", folder], extra={"NO_MKDOCS_2_WARNING": "1"})
 
 
