@@ -88,12 +88,12 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
     fields = msgspec.structs.fields(section)
     title = f"`[{path}]`" if path else "Top level"
     yield f"## {title}\n\n{(section.__doc__ or '').strip()}\n"
-    yield "| key | type | meaning | default |\n|---|---|---|---|"
+    yield "| key | type; default | meaning |\n|---|---|---|"
     for field in fields:
         if not is_section(field.type):
             needed = f"{path}.{field.encode_name}" in HAHN_STURSBERG_KEYS
             default = "required with scheme `hahn-stursberg`" if needed else _default(field, section, path)
-            cells = (f"`{field.encode_name}`", _describe_type(field), get_description(field), default)
+            cells = (f"`{field.encode_name}`", f"{_describe_type(field)}; {default}", get_description(field))
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
     for field in fields:
