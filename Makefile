@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
 CLIENTS := .venv-clients
 
-.PHONY: fly test test-all test-manual test-clients mutation docs clean
+.PHONY: fly test test-all test-manual test-clients mutation docs site clean
 
 fly: $(FLIES)
 	$(VENV)/bin/uavctl loopback --udp --config room
@@ -40,6 +40,10 @@ docs: $(STAMP)
 	$(VENV)/bin/python tools/check.py --write-docs
 	$(VENV)/bin/python tools/pictures.py
 
+# The manual as a site, in site/: open site/index.html. A page, link or heading that is missing fails the build.
+site: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --clean --config-file tools/mkdocs.yml
+
 $(FLIES): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
 	@echo "setting up $(VENV), once"
@@ -62,4 +66,4 @@ $(CLIENTS)/.installed: constraints-clients.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) build dist site *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

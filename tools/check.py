@@ -93,6 +93,19 @@ def check_wheel() -> str:
         return output
 
 
+def check_site() -> str:
+    """Build the site of the manual; a page, link or heading that is missing is an error."""
+    with tempfile.TemporaryDirectory(prefix="uavctl-site-") as folder:
+        command: list[str | Path] = [
+            BIN / "mkdocs",
+            "build",
+            "--strict",
+            "--config-file",
+            ROOT / "tools" / "mkdocs.yml",
+        ]
+        return run([*command, "--site-dir", folder], extra={"NO_MKDOCS_2_WARNING": "1"})
+
+
 def check_core() -> str:
     """Every branch of the safety core is run by its own tests."""
     for module in TARGETS:
@@ -121,7 +134,11 @@ def check_tests(failed: threading.Event, *, everything: bool) -> str:
 
 def stages(failed: threading.Event, *, everything: bool) -> tuple[tuple[str, Callable[[], str]], ...]:
     """All checks: what is told soonest first, and the types beside the tests, which take longest."""
-    slow = (("wheel, outside the checkout", check_wheel), ("branches of the safety core", check_core))
+    slow = (
+        ("wheel, outside the checkout", check_wheel),
+        ("site of the manual", check_site),
+        ("branches of the safety core", check_core),
+    )
     return (
         ("ruff check", lambda: run([BIN / "ruff", "check"])),
         ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),

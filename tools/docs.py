@@ -27,7 +27,7 @@ from uavctl.records import Record
 ROOT = Path(__file__).resolve().parent.parent
 _CONFIGURATION = """# Configuration
 
-This page is generated from the types in `uavctl/config/` (`make docs`); do not edit it.
+This page lists every key. It is generated from `uavctl/config/` (`make docs`); do not edit it.
 
 A configuration is a TOML file. The shortest one names a preset and overrides some keys:
 
@@ -38,20 +38,20 @@ base = "room-px4"
 north_m = [-2.0, 2.0]
 ```
 
-`--config NAME` takes a file or a preset: `paper`, `room`, `room-px4`, `room-ardupilot` or `room-hahn-stursberg`
-(complete examples in `uavctl/presets/`). `--set key.path=value` overrides any key and may be repeated, as in
-`--set link.loss=0.3` or `--set 'link.blackout=[[20, 40]]'`. A string needs no quotes.
-
-* `base` gives all keys that the file lacks. `[room]` then gives the limits by name instead of the lists of `[sets]`
-  and `[target]`. `uavctl init` writes such a file.
-* Without `base` a file needs `[plant]`, `[sets]` and `[cost]`. Other keys have a default, or follow from these.
-* All problems are reported at once, each with file, line, key and remedy (exit code 2). Each number has a range
-  (1e7 at most if none is given), and every text and list a longest length.
+* `--config NAME` takes a file or a preset: `paper`, `room`, `room-px4`, `room-ardupilot` or `room-hahn-stursberg`
+  (in `uavctl/presets/`).
+* `--set key.path=value` overrides any key and may be repeated: `--set link.loss=0.3`,
+  `--set 'link.blackout=[[20, 40]]'`. A string needs no quotes.
+* `base` gives the keys that the file lacks. Then `[room]` may replace the lists of `[sets]` and `[target]`.
+  `uavctl init` writes such a file.
+* Without `base` a file needs `[plant]`, `[sets]` and `[cost]`. Other keys have defaults or follow from these.
+* All problems are reported at once, with file, line, key and remedy (exit code 2). Numbers without a range here are
+  -1e7 to 1e7.
 * States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model
-  `velocity-reference` has besides: acceleration, lead of the vehicle's reference in position and velocity, integral.
-* n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
-* A plant of `matrices` without `axes` has no place in a room. `solve`, `design`, `campaign` and `uavctl.simulate`
-  take it.
+  `velocity-reference` adds acceleration, lead of the vehicle's reference in position and velocity, and integral.
+* n_x, n_u and n_w are the numbers of states, inputs (one for each axis) and disturbances. H is the horizon, Δt the
+  step.
+* A plant of `matrices` without `axes` cannot fly. `solve`, `design`, `campaign` and `uavctl.simulate` take it.
 """
 # Keys that follow from others where they are left out.
 _DERIVED = {
@@ -100,12 +100,12 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
     fields = msgspec.structs.fields(section)
     title = f"`[{path}]`" if path else "Top level"
     yield f"## {title}\n\n{(section.__doc__ or '').strip()}\n"
-    yield "| key | type | meaning | default |\n|---|---|---|---|"
+    yield "| key | type; default | meaning |\n|---|---|---|"
     for field in fields:
         if not is_section(field.type):
             needed = f"{path}.{field.encode_name}" in HAHN_STURSBERG_KEYS
             default = "required with scheme `hahn-stursberg`" if needed else _default(field, section, path)
-            cells = (f"`{field.encode_name}`", describe_type(field.type), get_description(field), default)
+            cells = (f"`{field.encode_name}`", f"{_describe_type(field)}; {default}", get_description(field))
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
     for field in fields:
@@ -115,6 +115,14 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
             yield from tables(one, f"[{name}]")
         elif is_section(field.type):
             yield from tables(field.type, name)
+
+
+def _describe_type(field: FieldInfo) -> str:
+    """Describe a type in few words: without the largest lengths and the ranges that the head of the page states."""
+    text = re.sub(r" \((entries|characters): at most \d+\)| \(>= -1e7, <= 1e7\)", "", describe_type(field.type))
+    text = re.sub(r"\(>= (\S+), <= (\S+)\)", r"(\1 to \2)", text)
+    text = text.replace('" or "', '", "').replace("whole number", "integer").replace("true or false", "boolean")
+    return text.replace("list of lists", "lists").replace("list of ", "")
 
 
 def _default(field: FieldInfo, section: type[Section], path: str) -> str:
@@ -208,60 +216,124 @@ def _items(schema: dict[str, object]) -> dict[str, object]:
     return fixed[0] if fixed else cast("dict[str, object]", schema["items"])
 
 
+_STATES = {
+    HandoverState.WAITING: "no vehicle is heard",
+    HandoverState.READY: "a vehicle is heard; the pilot may switch",
+    HandoverState.MODE: "take-off ordered: the mode is requested",
+    HandoverState.ARMING: "arming is requested",
+    HandoverState.CLIMBING: "the vehicle climbs by itself",
+    HandoverState.ENGAGING: "at height: OFFBOARD or GUIDED is requested",
+    HandoverState.RETURNING: "the same after `TAKEN_OVER`, by `ctl engage`",
+    HandoverState.ENGAGED: "the controller flies",
+    HandoverState.FAILSAFE: "a failsafe of the vehicle flies; nothing is sent",
+    HandoverState.UNCLEAR: "another mode for an unknown reason; nothing is sent",
+    HandoverState.TAKEN_OVER: "somebody else flies; nothing is sent without an order",
+    HandoverState.LANDING: "landing is requested",
+    HandoverState.SETTLING: "the vehicle lands by itself",
+    HandoverState.DONE: "disarmed",
+    HandoverState.FAILED: "the vehicle has not carried out a request",
+}
+_EVENTS = {
+    HandoverEvent.REBOOT: "the vehicle has restarted",
+    HandoverEvent.LAND: "the controller, or the operator during the climb, requests landing",
+    HandoverEvent.UNSAFE: "in the climb: impossible positions (they jump, or contradict inertial data or the "
+    "vehicle's velocity), positions beyond the limits of `[sets]` by more than `envelope.outside_m`, or none for "
+    "a horizon",
+    HandoverEvent.GRANTED: "the request has taken effect",
+    HandoverEvent.REFUSED: "the vehicle refused for good, or not within tries and times of `[hand_over]`. Event "
+    "`refused` has its reason (COMMAND_ACK, STATUSTEXT); exit code 1",
+    HandoverEvent.SILENCE: "no heartbeat, or the last one is too old",
+    HandoverEvent.TAKE_OFF: "`--arm --takeoff HEIGHT`; nothing else leads to arming",
+    HandoverEvent.ENGAGE: "`uavctl ctl engage`; nothing else leads back from the pilot",
+    HandoverEvent.LEFT: "armed when first heard, and the daemon before ended unasked in flight "
+    "([operation](operation.md#after-the-pilots-switch))",
+    HandoverEvent.DISARMED: "disarmed",
+    HandoverEvent.FAILSAFE: "a [failsafe of the vehicle](#failsafes-of-the-vehicle) acts",
+    HandoverEvent.UNCLEAR: "another mode, and nothing shows who chose it",
+    HandoverEvent.OTHER: "a person flies; or a failsafe on a flight that the pilot began",
+    HandoverEvent.EXTERNAL: "armed, in OFFBOARD or GUIDED",
+    HandoverEvent.PENDING: "the request has not taken effect yet",
+}
+
+
 def hand_over_page() -> str:
     """The page docs/hand-over.md, made from the table."""
-    return f"""# Who flies: the hand-over
+    events = "\n".join(f"| `{event}` | {_EVENTS[event]} |" for event in HandoverEvent)
+    return f"""# The hand-over between pilot and controller
 
-Written from the table in `uavctl/mavlink/handover_states.py` (`make docs`).
-A word on an arrow is what a tick sees; of several
-things the first in this list counts:
-{", ".join(f"`{seen}`" for seen in HandoverEvent)}.
-What is not drawn changes nothing. Setpoints are sent in `ENGAGED` only; neutral ones (zero acceleration) where PX4
-wants a stream before it gives OFFBOARD: in `READY`, on the way up (not to ArduPilot, whose climb they would end), and
-in `RETURNING`.
+This page lists the states between the pilot, the vehicle's own modes and the controller. It is generated from
+`uavctl/mavlink/handover_states.py` (`make docs`); do not edit it.
 
-```mermaid
-{drawing()}```
+Example: `uavctl fly --arm --takeoff 1.2` goes from `READY` through `MODE`, `ARMING`, `CLIMBING` and `ENGAGING` to
+`ENGAGED`.
 
-* `take-off` is `--arm --takeoff HEIGHT`; `engage` is `uavctl ctl engage`. Nothing else leads towards arming or back
-  from the pilot. `land` comes from the controller, or from the operator on the way up.
-* `left`: the daemon before this one ended while it had the vehicle, and nobody had asked it to (it was killed, or
-  failed); and the vehicle, which has not started anew since, is armed when it is heard first. Nothing is sent, as
-  setpoints would end PX4's failsafe; `uavctl ctl engage` takes it up again. Whoever ends so leaves word in the file
-  of its lock ([operation.md](operation.md#how-it-ends)).
-* `refused`: the vehicle said no for good, or did not do it within the tries and times of `[hand_over]`
-  (configuration.md). Its own reason (COMMAND_ACK, STATUSTEXT) is in the event `refused`, and ends the program with 1.
-* `failsafe`: the vehicle itself says that a failsafe or a fence of its own acts (system status CRITICAL; "failsafe" or
-  "fence breached" in a text of any severity; FENCE_STATUS, SYS_STATUS), and is in a mode that these choose
-  ({_modes(ModeChoice.EITHER)}), or in one that nothing else chooses
-  ({_modes(ModeChoice.FAILSAFE)}).
-  On a flight that began with `--arm` it is waited for: PX4 takes its climb up again by itself, and so does the
-  hand-over, all within `climb_s`. A failsafe that lands has `land_s`; one that hovers, or that has ended an engaged
-  flight, is ended by our landing after `climb_s`, unless `ctl engage` comes first. A flight that the pilot began is
-  released.
-* `other`: a person has it. A stick or switch of the remote control has moved at the time (RC_CHANNELS, by a tenth of
-  its way); or a ground station has ordered a mode; or only a person chooses this mode,
-  and a remote control is heard whose channels the vehicle does not tell.
-  What the vehicle says of a failsafe explains such a mode too, if no stick has moved ({_degrades()}):
-  then the exit code is 1, and nothing is sent.
-* `unclear`: none of these shows who it was. Nothing is sent, and word of it may still come. What we took off, and
-  flies by itself in the air, is asked to land after `climb_s`, unless a stick moves. The exit code is 1.
-* `unsafe`: on the way up the positions cannot be the vehicle's own (they jump, or contradict what it feels or its own
-  velocity), or are beyond the limits of `[sets]` by more than `envelope.outside_m`, or none has come for a horizon. The
-  climb is broken off and the vehicle asked to land. Positions further off what it feels than noise explains are not
-  relayed, nor any until for 3 s none has been: a vehicle that lands needs them once they are right again.
-* Landing: once the vehicle has shown that it lands, another mode is the pilot's. So it is once landing was granted: at
-  once, or after 2 s where it is the mode of before, which a slow vehicle may still be in. What we took off is asked
-  to land as long as it is heard armed, up to ten times `land_s`; that `land_s` is over is told.
-* PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
-  (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
-* What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
-  still says otherwise 0.3 s later is the pilot's word.
-* A request of the external mode, or of landing, is made again right after a heartbeat only: in between the pilot may
-  have switched, which the next one shows. Landing is asked for without heartbeats, too. The first request of the
-  external mode, at the end of a climb, and of landing wait for none: a pilot who switches in that second has to switch
-  again. A switch that a heartbeat has shown is his, whatever ends the flight.
-* While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
+## States
+
+An event that is missing keeps the state.
+
+{transitions_table()}
+Setpoints are sent in `ENGAGED` only. Neutral setpoints (zero acceleration) are sent where PX4 needs a stream before
+OFFBOARD: in `READY`, in the climb (not to ArduPilot, whose climb they would end) and in `RETURNING`. If heartbeats
+of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
+
+## Events
+
+If several occur in a tick, the first of this list counts.
+
+| event | meaning |
+|---|---|
+{events}
+
+## Take-off
+
+| | PX4 | ArduPilot |
+|---|---|---|
+| sequence | AUTO.TAKEOFF, arming, OFFBOARD | GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints |
+| the climb ends | when positions show the height, not at MIS_TAKEOFF_ALT | at nine tenths of the height |
+
+After `unsafe` the vehicle is asked to land. Positions further from inertial data than noise explains are not
+relayed, until for 3 s all agree.
+
+## Failsafes of the vehicle
+
+Evidence: system status CRITICAL, "failsafe" or "fence breached" in a text, FENCE_STATUS or SYS_STATUS. In addition
+the mode must be one that failsafes choose ({_modes(ModeChoice.EITHER)}), or one that nothing else chooses
+({_modes(ModeChoice.FAILSAFE)}).
+
+| flight | reaction |
+|---|---|
+| began with `--arm`, failsafe ends in the climb | PX4 continues its climb, and so does the hand-over, within \
+`climb_s` |
+| began with `--arm`, failsafe lands | wait for `land_s` |
+| began with `--arm`, failsafe hovers, or has ended an engaged flight | request landing after `climb_s`, unless \
+`uavctl ctl engage` comes first |
+| began by the pilot | release the vehicle |
+
+## Another mode
+
+| evidence | event | reaction |
+|---|---|---|
+| a stick or switch moved (RC_CHANNELS, a tenth of its way); a ground station ordered the mode; or only a person \
+chooses this mode, with a remote control whose channels the vehicle does not report | `other` | the person \
+flies; nothing is sent |
+| a failsafe explains the mode, and no stick moved ({_degrades()}) | `other` | the same; exit code 1 |
+| none of these | `unclear` | nothing is sent. After our take-off, landing is requested after `climb_s`, unless \
+a stick moves. Exit code 1 |
+
+The pilot's switch counts once a heartbeat shows it:
+
+* A request for the external mode or for landing is repeated only right after a heartbeat, so that a switch shows
+  first.
+* The first request at the end of a climb, and that for landing, do not wait. A pilot who switches in that second
+  must switch again.
+* A COMMAND_ACK counts before the next heartbeat. A heartbeat that still shows another mode 0.3 s later is the
+  pilot's switch.
+
+## Landing
+
+Once the vehicle shows that it lands, another mode is the pilot's. After landing was granted this holds at once, or
+after 2 s for the mode of before. A vehicle that we took off is asked to land while it is heard armed, up to ten
+times `land_s`; the end of `land_s` is reported. Landing is requested without heartbeats, too.
 """
 
 
@@ -279,17 +351,18 @@ def _degrades() -> str:
     return "; ".join(f"{name}: {', '.join(sorted(profile.degraded_modes))}" for name, profile in PROFILES.items())
 
 
-def drawing() -> str:
-    """The table as a Mermaid state diagram: every way from one state to another, by what is seen."""
-    lines = ["stateDiagram-v2", "    [*] --> WAITING"]
+def transitions_table() -> str:
+    """Every way from one state to another as a Markdown table, by event."""
+    lines = ["| state | meaning | event: next state |", "|---|---|---|"]
     for before in HandoverState:
         ways: dict[HandoverState, list[str]] = {}
-        for seen in HandoverEvent:
-            after = TRANSITIONS[before, seen][0]
+        for event in HandoverEvent:
+            after = TRANSITIONS[before, event][0]
             if after is not before:
-                ways.setdefault(after, []).append(seen.value)
-        lines += [f"    {before.name} --> {after.name}: {', '.join(seen)}" for after, seen in ways.items()]
-    return "\n".join([*lines, "    DONE --> [*]", "    FAILED --> [*]"]) + "\n"
+                ways.setdefault(after, []).append(f"`{event}`")
+        cells = "; ".join(f"{', '.join(events)}: {after.name}" for after, events in ways.items())
+        lines.append(f"| `{before.name}` | {_STATES[before]} | {cells or 'end'} |")
+    return "\n".join(lines) + "\n"
 
 
 _MANUAL = """.SH EXIT STATUS

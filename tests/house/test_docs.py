@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from docs import PAGES, drawing, topics_page
+from docs import PAGES, topics_page, transitions_table
 from logs.recording.derived_topics import PLOTS, VIEWS
 from logs.recording.topics import TOPICS
 from uavctl.mavlink.handover_states import TRANSITIONS
@@ -19,11 +19,18 @@ def test_a_page_is_up_to_date(page: Path) -> None:
     assert page.read_text(encoding="utf-8") == PAGES[page](), "run `make docs`"
 
 
-def test_the_drawing_has_every_transition_once() -> None:
-    lines = drawing().splitlines()
-    transitions = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
-    assert sum("-->" in line for line in lines) == len(transitions) + 3  # the beginning, two ends
-    assert "    TAKEN_OVER --> RETURNING: engage" in lines
+def test_the_table_of_the_hand_over_has_every_transition_once() -> None:
+    rows = [line.strip("| ").split(" | ") for line in transitions_table().splitlines()[2:]]
+    ways = [
+        (before.strip("`"), event.strip("`"), after)
+        for before, _, cell in rows
+        for events, _, after in (way.partition(": ") for way in cell.split("; ") if ": " in way)
+        for event in events.split(", ")
+    ]
+    assert len(set(ways)) == len(ways)
+    assert set(ways) == {
+        (before.name, event, after.name) for (before, event), (after, _) in TRANSITIONS.items() if before is not after
+    }
 
 
 def test_page_lists_every_topic_and_field() -> None:

@@ -32,7 +32,7 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     origin_deg_m: Annotated[
         Position,
         declare(
-            "latitude, longitude [deg] and altitude [m] for an ArduPilot without a place on the globe; any will do"
+            "latitude, longitude [deg] and altitude [m] of the origin for an ArduPilot without GPS; any place will do"
         ),
     ] = (47.397742, 8.545594, 488.0)
 
@@ -109,9 +109,7 @@ class SourceConfig(Section, frozen=True, kw_only=True):
             ],
             ...,
         ],
-        declare(
-            "messages that are taken; LOCAL_POSITION_NED, if it is named, is the vehicle's own estimate", length=(1, 10)
-        ),
+        declare("accepted messages; LOCAL_POSITION_NED is the vehicle's own estimate", length=(1, 10)),
     ] = ("VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY")
     system_id: Annotated[int, declare("MAVLink system id that positions must come from; 0 takes any", "", 0, 255)] = 0
     rate_hz: Annotated[float, declare("positions that the design counts on; 0: one each Δt", "1/s", 0, 1000)] = 0.0
@@ -262,10 +260,10 @@ MAX_REHEARSALS = 1000  # minutes, and some 400 MB for draws and states of two mi
 
 
 class CheckConfig(Section, frozen=True, kw_only=True):
-    """`uavctl check`, and what it has to say before `uavctl fly --arm` arms (docs/check.md)."""
+    """`uavctl check`, and the check before `uavctl fly --arm` arms (docs/check.md)."""
 
-    seconds: Annotated[float, declare("how long positions and vehicle are listened to", "s", 0.001, 600)] = 8.0
-    wait_s: Annotated[float, declare("longer wait for a vehicle without an own position yet", "s", 0, 600)] = 15.0
+    seconds: Annotated[float, declare("time of listening to positions and vehicle", "s", 0.001, 600)] = 8.0
+    wait_s: Annotated[float, declare("longer wait for a vehicle that has no position yet", "s", 0, 600)] = 15.0
     same_origin: Annotated[
         bool,
         declare(
@@ -277,10 +275,12 @@ class CheckConfig(Section, frozen=True, kw_only=True):
         float, declare("largest distance between the vehicle's own position and the cameras'", "m", 0.001, 1e6)
     ] = 0.5
     move_m: Annotated[float, declare("shortest movement of the body that shows axes", "m", 0.001, 1000)] = 0.3
-    yaw_deg: Annotated[float, declare("largest turn of the cameras' north and the vehicle's", "deg", 0.01, 45)] = 10.0
+    yaw_deg: Annotated[
+        float, declare("largest angle between the cameras' north and the vehicle's", "deg", 0.01, 45)
+    ] = 10.0
     margin_m: Annotated[float, declare("how far outside `sets` a flight may begin", "m", 0, 1000)] = 0.25
     rehearsals: Annotated[int, declare("rehearsals, for the risk to leave the room", "", 0, MAX_REHEARSALS)] = 60
-    battery_v: Annotated[float, declare("least voltage of the battery; 0 does not judge it", "V", 0, 1000)] = 0.0
+    battery_v: Annotated[float, declare("least voltage of the battery; 0: not tested", "V", 0, 1000)] = 0.0
     accept: Annotated[tuple[str, ...], declare("items that may fail without a refusal to arm", length=100)] = ()
 
 
@@ -296,4 +296,4 @@ class RelayConfig(Section, frozen=True, kw_only=True):
         bool,
         declare("stamp positions by the vehicle's clock, for a vehicle that asks for our time (PX4); else by ours"),
     ] = True
-    rate_hz: Annotated[float, declare("at most so many a second; the newest are sent", "1/s", 0.1, 1000)] = 50.0
+    rate_hz: Annotated[float, declare("largest rate; the newest are sent", "1/s", 0.1, 1000)] = 50.0

@@ -33,7 +33,9 @@ class CameraConfig(Section, frozen=True, kw_only=True):
     latency_s: Annotated[float, declare("processing time in the cameras, before the link", "s", 0, 60)] = 0.0
     jitter_s: Annotated[float, declare("uniform extra processing time; samples may overtake", "s", 0, 60)] = 0.0
     clock_offset_s: Annotated[float, declare("offset of the cameras' clock", "s", -3999, 1e9)] = 0.0
-    clock_drift_ppm: Annotated[float, declare("gain of the cameras' clock; seen: 1e4 to 3e4", "ppm", -1e5, 1e5)] = 0.0
+    clock_drift_ppm: Annotated[float, declare("gain of the cameras' clock; recorded: 1e4 to 3e4", "ppm", -1e5, 1e5)] = (
+        0.0
+    )
     occluded: Annotated[Spans, declare("spans [from_s, to_s] without samples", "s", length=MAX_SPANS)] = ()
     occlusions_per_s: Annotated[float, declare("random occlusions that begin in a second", "1/s", 0, 100)] = 0.0
     occlusion_s: Annotated[float, declare("their mean length (exponential)", "s", 0.001, MAX_DURATION_S)] = 0.5
@@ -88,11 +90,11 @@ class ChecksConfig(Section, frozen=True, kw_only=True):
             length=MAX_SPANS,
         ),
     ] = ()
-    clears: Annotated[bool, declare("whether a failsafe for want of a position ends with its cause, as in PX4")] = False
+    clears: Annotated[bool, declare("whether a failsafe without a position ends with its cause, as in PX4")] = False
 
 
 class FaultConfig(Section, frozen=True, kw_only=True):
-    """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
+    """A fault of the simulated flight at a given time; `uavctl sim --faults FILE` reads a list of them."""
 
     at_s: Annotated[float, declare("when, since the start", "s", 0, MAX_DURATION_S)]
     kind: Annotated[
@@ -147,7 +149,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
         Literal["linear", "quadrotor"],
         declare("the plant of `[plant]` without its dead time, or a quadrotor with rotors, battery and autopilot"),
     ] = "linear"
-    autopilot: Annotated[Literal["px4", "ardupilot"], declare("whose behaviour the simulated autopilot shows")] = "px4"
+    autopilot: Annotated[Literal["px4", "ardupilot"], declare("the simulated autopilot")] = "px4"
     streams: Annotated[
         Literal["few", "onboard"],
         declare("messages that come unasked: `few`, or `onboard`: over 300 a second, as a PX4 sends on such a link"),
@@ -157,7 +159,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
     seed: Annotated[int, declare("seed of every random draw", "", 0, MAX_SEED)] = 0
     start_position_m: Annotated[Position, declare("position at the start, local NED", "m")] = (0.0, 0.0, 0.0)
     start_velocity_mps: Annotated[Wind, declare("velocity at the start, local NED", "m/s")] = (0.0, 0.0, 0.0)
-    clock_drift_ppm: Annotated[float, declare("gain of the vehicle's clock; seen: -1.4e4", "ppm", -1e5, 1e5)] = 0.0
+    clock_drift_ppm: Annotated[float, declare("gain of the vehicle's clock; recorded: -1.4e4", "ppm", -1e5, 1e5)] = 0.0
     setpoint_timeout_s: Annotated[
         Annotated[float, Meta(ge=0.01, le=3600)] | None,
         declare(

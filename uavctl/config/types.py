@@ -150,7 +150,7 @@ Likelihood = Annotated[float, Meta(gt=0, lt=1)] | None
 
 
 class SmpcConfig(Section, frozen=True, kw_only=True):
-    """The predictive controller; scheme `age-conditioned` passes over what only the other one asks for."""
+    """The predictive controller; scheme `age-conditioned` ignores keys of the other one."""
 
     scheme: Annotated[
         Scheme,
@@ -192,7 +192,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
 
 
 class ScheduleConfig(Section, frozen=True, kw_only=True):
-    """Information delays d_t: what feedback may be counted on in stage t."""
+    """Information delays d_t: the age of the feedback that stage t counts on."""
 
     rule: Annotated[
         Literal["fixed", "search", "greedy"],
@@ -244,11 +244,7 @@ class RiskConfig(Section, frozen=True, kw_only=True):
         ),
     ] = "observed"
     adapt: Annotated[
-        bool,
-        declare(
-            "move away from limits while they are left too often, and back while less often; not with budgets "
-            "`configured`"
-        ),
+        bool, declare("keep further from limits while they are left too often; not with budgets `configured`")
     ] = True
 
 
@@ -284,34 +280,30 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     gate_sigma: Annotated[
         float,
         declare(
-            "standard deviations by which a position may miss the prediction, beside gate_m and what inputs "
-            "can have done, before it counts as lost; a value that repeats is frozen once the prediction has "
-            "moved as far",
+            "standard deviations by which a position may miss the prediction, in addition to gate_m and the effect of "
+            "inputs; beyond, it counts as lost, and a repeated value as frozen",
             "",
             0.001,
             1e6,
         ),
     ] = 6.0
-    gate_m: Annotated[float, declare("distance that gate_sigma allows besides, for gusts", "m", 0, 1e6)] = 0.3
+    gate_m: Annotated[float, declare("distance allowed in addition, for gusts", "m", 0, 1e6)] = 0.3
     bias_drift: Annotated[
         float,
         declare(
-            "standard deviation that a lasting unknown acceleration (wind, hover thrust) gains in a second; "
-            "the filter estimates it, and inputs compensate it; 0: none, as printed",
+            "standard deviation that an unknown lasting acceleration (wind, hover thrust) gains in a second; it is "
+            "estimated and compensated; 0: none, as printed",
             "input units/√s",
             0,
             1000,
         ),
     ] = 0.0
-    bias_max: Annotated[
-        float,
-        declare("part of it that plans reserve of each input, so that their promise holds", "input units", 0, 1000),
-    ] = 0.0
+    bias_max: Annotated[float, declare("part of each input that plans reserve for it", "input units", 0, 1000)] = 0.0
     bias_share: Annotated[
         float,
         declare(
-            "share of an input's half range that may compensate it, at least bias_max; beyond bias_max the "
-            "setpoint limiter cuts plans at their limits",
+            "share of an input's half range that may compensate it, at least bias_max; above bias_max the setpoint "
+            "limiter cuts plans",
             "",
             0,
             1,
@@ -320,8 +312,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     inertial_std_mps2: Annotated[
         float,
         declare(
-            "standard deviation of the acceleration by inertial sensors and attitude in a tick; they move the "
-            "estimate between positions; 0: not used",
+            "standard deviation of the acceleration by inertial sensors and attitude in a tick; 0: not used",
             "m/s²",
             0,
             100,
@@ -336,7 +327,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
             above=0,
         ),
     ] = 0.1
-    inertial_bias_s: Annotated[float, declare("time in which that comes and goes", "s", 0.1, MAX_DURATION_S)] = 20.0
+    inertial_bias_s: Annotated[float, declare("correlation time of that bias", "s", 0.1, MAX_DURATION_S)] = 20.0
 
 
 class FallbackConfig(Section, frozen=True, kw_only=True):
