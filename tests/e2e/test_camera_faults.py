@@ -17,6 +17,7 @@ WORLDS = [
     ("room", "px4", "linear"),
     ("room-ardupilot", "ardupilot", "linear"),
 ]
+SLOW_AND_NOISY = ("sim.camera.rate_hz=5.0", "sim.camera.noise_std_m=0.05", "duration_s=5.0")
 
 
 @pytest.mark.fault(100)
@@ -57,5 +58,14 @@ def test_a_camera_fault_is_flown_through(kind: str, seed: int, preset: str, auto
 def test_noise_from_the_first_position_on_is_no_motion(seed: int, preset: str, autopilot: str, plant: str) -> None:
     """Two or three positions with noise of 5 cm, taken for exact, make a velocity of metres a second."""
     flight = fly_with_fault("white-5cm", seed, preset, autopilot, "duration_s=5", plant=plant)
+    assert flight.codes is not None and flight.modes is not None
+    assert not flight.codes.keys() & ENVELOPE_CODES and flight.modes[-1][1] == ControlMode.TRACK
+
+
+@pytest.mark.fault(100)
+@pytest.mark.parametrize(("seed", "autopilot"), [(2001, "px4"), (2001, "ardupilot"), (2008, "px4")])
+def test_noise_of_a_slow_source_that_loses_positions_is_no_motion(seed: int, autopilot: str) -> None:
+    """Positions that were lost left no four in a row close enough to show the noise before two monitors judged them."""
+    flight = fly_with_fault("", seed, f"room-{autopilot}", autopilot, *SLOW_AND_NOISY)
     assert flight.codes is not None and flight.modes is not None
     assert not flight.codes.keys() & ENVELOPE_CODES and flight.modes[-1][1] == ControlMode.TRACK

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from deception_rig import BLACKOUT_S, DeceivedFlight, Deception, draw_flight, fly_deceived
+from deception_rig import BLACKOUT_S, DeceivedFlight, Deception, draw_flight, draw_hover, fly_deceived
 
 from uavctl.records import ControlMode
 
@@ -26,6 +26,13 @@ AFTER_ANOTHER = (
     (30005, "quadrotor", (("positions", "scaled", 2.0),)),
     (30006, "linear", (("positions", "delayed", 2.0),)),
     (700004, "quadrotor", (("attitude", "frozen", -0.49), ("positions", "delayed", 3.16))),
+)
+# Hovers that were outside by 0.5 to 1.0 m before two velocities that point against each other were averaged.
+HOVERS = (
+    (103, "flipped", "quadrotor"),
+    (107, "flipped", "linear"),
+    (108, "swapped", "quadrotor"),
+    (114, "flipped", "quadrotor"),
 )
 WORST_LINEAR = (287, 290, 316, 323)  # of 71 flights of the linear plant, both autopilots
 
@@ -73,3 +80,11 @@ def test_lasting_lies_of_inertial_data_alone_do_not_brake_at_every_lost_position
     later = [mode for at_s, mode in flight.modes if at_s > blackout_s + BLACKOUT_S + 1.5]
     assert ControlMode.BRAKE not in later and flight.modes[-1][1] is ControlMode.TRACK
     assert flight.outside_m <= OUTSIDE_M
+
+
+@pytest.mark.slow
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(("seed", "kind", "plant"), HOVERS)
+def test_a_wrong_velocity_accelerates_no_vehicle_that_hovers_before_a_wall(seed: int, kind: str, plant: str) -> None:
+    flight = fly_deceived(*draw_hover(seed, kind, plant))
+    assert flight.outside_m <= 0.2

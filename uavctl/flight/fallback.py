@@ -14,8 +14,8 @@ A state machine of four modes, each with a time limit:
     LAND                   LAND once its zero has been sent
 
 1. Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.monitors.vehicle_velocity`),
-   else by the predicted one. By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold
-   runs on.
+   else by the predicted one; by the mean of both where inertial data carry that on, and they point against each other.
+   By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold runs on.
 2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. By a
    prediction from inputs alone the vehicle brakes only until that is slow.
 3. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.

@@ -29,9 +29,9 @@ FEW = 3.0
 _RESIDUALS, _LEAST_RESIDUALS = 15, 3  # a second or so at 20 Hz
 # Neighbours whose distances in time have a larger product are too far apart: 4 m/s² bend a path by 0.02 m within it.
 _LARGEST_S2 = 0.01
-# The same for three distances and a parabola: 5 m/s³, the most that setpoints change by, make 0.02 m of it. Four
-# positions in a row at 5 Hz are close enough.
-_LARGEST_S3 = 0.025
+# The same for three distances and a parabola: 5 m/s³, the most that setpoints change by, make a residual of 0.025 m
+# within it. Four positions at 5 Hz are close enough, also where one or two between them are lost.
+_LARGEST_S3 = 0.05
 _Place = tuple[int, Vec3]  # capture time [ns], position [m]
 _MEDIAN_3D = 1.538  # median length of a vector of three independent values with standard deviation 1
 
