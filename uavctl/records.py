@@ -427,7 +427,7 @@ class RiskRecord(Record, frozen=True, kw_only=True):
     age: int  # age of the information that moved the vehicle here [steps], from 1 on
     # Probability that the vehicle is outside of its limits, given all that is known; None while it is not flown
     outside: float | None
-    # Level of the budgets: 0, the certificate, which holds on any link, or that of an observed link. Recordings of before
+    # Level of the budgets: 0, the certificate, which holds on any link, or that of an observed link. Earlier recordings
     # have other levels, and a factor `scale` of the deviations
     level: int
     widening: float  # factor of all standard deviations, by the risk as observed
