@@ -13,17 +13,20 @@ from other_links import CELLS, WALL_M, Cell, draw_run, make_problem
 from other_links import fly as fly_scheme
 
 from uavctl.arrays import Array
-from uavctl.smpc.answer import Preview
+from uavctl.smpc.answer import CONFIGURED_LEVEL, Preview, QuestionError
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.reference import (
+    CERTIFICATE_LEVEL,
     CONTINUATIONS,
     FIRST_LOSSES,
+    LAST_LEVEL,
     find_nearest_link,
     get_link,
     get_observed_level,
 )
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import lqr
+from uavctl.smpc.sets import Polytope
 
 ALLOWED, SETTLED, RUNS, STEPS = 0.05, 100, 60, 1100
 
@@ -141,6 +144,32 @@ def test_a_plan_is_the_nearest_to_the_regulator_around_the_references_that_keeps
     answer = solver.solve(0, x, target, Preview(age=age, level=level, widening=f, silence_widening=g))
     np.testing.assert_allclose(answer.inputs, u.value, atol=2e-4)
     assert answer.offset > 0.0
+
+
+@pytest.mark.parametrize("target", [19.0, 25.0, 40.0])
+@pytest.mark.parametrize("level", [CONFIGURED_LEVEL, CERTIFICATE_LEVEL, 1, 60, LAST_LEVEL])
+def test_between_two_near_walls_a_plan_rests_between_them(target: float, level: int) -> None:
+    problem = make_problem(1)
+    narrow = replace(problem, state_set=Polytope.from_box([15.0, -8.0], [WALL_M, 8.0]))
+    link = bernoulli(np.array([0.7]))
+    solver = ConditionedSolver(narrow, link, ALLOWED, has_lower_levels=True, bounds_slack=False)
+    preview = Preview(level=level, widening=4.0, silence_widening=4.0)
+    answer = solver.solve(0, np.array([17.0, 0.0]), np.array([target, 0.0]), preview)
+    assert answer.reference[0] == pytest.approx(17.5, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "preview",
+    [
+        Preview(level=LAST_LEVEL + 1),
+        Preview(level=-2),
+        *(Preview(widening=factor) for factor in (0.0, -1.0, math.inf, math.nan)),
+        *(Preview(silence_widening=factor) for factor in (0.0, math.nan)),
+    ],
+)
+def test_levels_and_factors_that_cannot_be_are_refused(solver: ConditionedSolver, preview: Preview) -> None:
+    with pytest.raises(QuestionError):
+        solver.solve(0, solver.problem.target, solver.problem.target, preview)
 
 
 @pytest.mark.slow

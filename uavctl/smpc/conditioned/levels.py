@@ -28,7 +28,13 @@ from uavctl.smpc.conditioned.backoffs import (
     find_opposite_rows,
 )
 from uavctl.smpc.conditioned.program import SlewRows
-from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, COUNTED_HORIZONS, ReferenceProgram, get_link
+from uavctl.smpc.conditioned.reference import (
+    CERTIFICATE_LEVEL,
+    COUNTED_HORIZONS,
+    LAST_LEVEL,
+    ReferenceProgram,
+    get_link,
+)
 from uavctl.smpc.link import AgeModel, RunLengthAges
 from uavctl.smpc.nominal import ControlProblem, Lqr, Part, propagate_covariance
 from uavctl.smpc.plant import Plant
@@ -168,8 +174,8 @@ class RiskLevels:
         """Return a level; that of an observed link is made when it is asked for first."""
         found = self._levels.get(level)
         if found is None:
-            if self._free is None:
-                raise QuestionError(f"level {level}: the design has the budgets of the configured link alone")
+            if self._free is None or not CERTIFICATE_LEVEL < level <= LAST_LEVEL:
+                raise QuestionError(f"the design has no level {level}")
             link = get_link(level)
             near = motion = self._make_observed(RunLengthAges(*link, self._begins))
             if all(program.is_quick(link) for program in self._reference_programs.values()):

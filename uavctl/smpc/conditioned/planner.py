@@ -70,6 +70,7 @@ METHOD = "age-conditioned"
 ROUNDS = 2  # rounds of an allocation
 # Rounds if the plan does not keep its back-offs: half of the plans between two near walls need the third.
 MAX_ROUNDS = 3
+MAX_FACTOR = 1e6  # largest factor of deviations: variances stay far from what a program can take
 SILENT_STAGES = 2  # stages at the end of a plan that a silence may outlast: a regulator is at its reference in two
 MAX_SHIFT_ITERATIONS = 300  # iterations of all programs after which no more risk is shifted
 
@@ -224,6 +225,9 @@ class ConditionedSolver:
         """
         if not 0 <= preview.age < self.problem.horizon:
             raise QuestionError(f"a position {preview.age} steps old; budgets are for 0 to {self.problem.horizon - 1}")
+        factors = preview.widening, preview.silence_widening
+        if not all(0.0 < factor <= MAX_FACTOR for factor in factors):
+            raise QuestionError(f"factors {factors} of the deviations; they are above 0, up to {MAX_FACTOR:g}")
         if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         rest = self._find_rest(target, preview)
@@ -315,7 +319,7 @@ class ConditionedSolver:
         count = self._count_limits(target, sides, preview)
         if not count:
             return ()
-        distances = self._widen_distances(count, preview)
+        distances = self._widen_distances(count, sides, preview)
         # Margins (m,) at the target and at rest; the row keeps d_j with the share λ_j of the way between them
         at_target, at_rest = sides - self._c @ target, sides - self._c @ rest
         is_limit = (at_target < distances[-1]) & (at_rest > at_target)
@@ -330,12 +334,20 @@ class ConditionedSolver:
             if is_limit[program.columns].any()
         ]
 
-    def _widen_distances(self, count: int, preview: Preview) -> Array:
-        """Return the distances (A, m) by age of a target that `count` rows limit: the last ones hold for a silence."""
+    def _widen_distances(self, count: int, sides: Array, preview: Preview) -> Array:
+        """Return the distances (A, m) by age of a target that `count` rows limit: the last ones hold for a silence.
+
+        Between opposite limits they take no more than half of the room each.
+        """
         backoffs = self._levels.get(preview.level).near.reference_backoffs
         distances: Array = preview.widening * backoffs[:, min(count, len(self._parts)) - 1]
         if len(distances) > 1:
             distances[-SILENT_STAGES:] *= preview.silence_widening
+        first, second = self._opposite.T
+        # d_i <= (b_i + b_j) / 2 for c_i = -c_j
+        half = 0.5 * (sides[first] + sides[second])
+        for rows in (first, second):
+            distances[:, rows] = np.minimum(distances[:, rows], half)
         return distances
 
     def _count_limits(self, target: Array, sides: Array, preview: Preview) -> int:
@@ -393,7 +405,7 @@ class ConditionedSolver:
         reference, count = np.array(target), self._count_limits(target, sides, preview)
         if not count:
             return reference
-        distance = self._widen_distances(count, preview)[-1]
+        distance = self._widen_distances(count, sides, preview)[-1]
         for program, equilibria in zip(self._parts, self._reference_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference

@@ -40,6 +40,7 @@ from uavctl.smpc.sets import Equilibria
 FIRST_LOSSES = (0.03, 0.1, 0.2, 0.3, 0.42, 0.55, 0.67, 0.8, 0.9)
 CONTINUATIONS = (0.05, 0.15, 0.3, 0.42, 0.55, 0.67, 0.75, 0.82, 0.88, 0.92, 0.95, 0.975)
 CERTIFICATE_LEVEL = 0  # level of the budgets that hold on any link; the levels of these links follow
+LAST_LEVEL = CERTIFICATE_LEVEL + len(FIRST_LOSSES) * len(CONTINUATIONS)
 RARE_SHARE = 2e-3  # least share of time of an age with a distance of its own
 # Largest ratio of variances, with and without errors that the regulator has not undone yet, at which a reference by age
 # is used. It is 1.1 on the paper's plant, where that costs 15 % less than rows with 60 % losses. In the rooms it is 2.7
