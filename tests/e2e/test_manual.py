@@ -38,7 +38,7 @@ OMITTED = {
     r"--move$": "a person has to move the body",
     r"^uavctl fly \.\.\.": "the dots are the reader's",
     r"--dask ": "needs a cluster",
-    r"^uavctl bench|^python tools/storage\.py": "measures for minutes; tests/lab/bench, tests/e2e",
+    r"^uavctl bench|^python tools/(storage|other_links)\.py": "minutes; tests/lab/bench, tests/smpc, tests/e2e",
     r"^uavctl paper --full|docs/campaigns/(flights\S*|room)\.toml": "minutes; tests/lab/paper, tests/lab/campaign",
     r"^uavctl tune ": "flies for minutes; tests/lab/tune",
     r"^uavctl log replay OTHER\.mcap": "another's recording; tests/logs/recording/test_foreign_stream.py",
