@@ -32,8 +32,8 @@ from uavctl.smpc.conditioned.adaptation import (
     count_age,
     count_innovation,
 )
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_age_prior
-from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_observed_level
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import ControlProblem, propagate_covariance
 from uavctl.smpc.plant import Plant
@@ -155,12 +155,12 @@ def fly(
     adapts = budgets != "configured"
     problem, plant = solver.problem, solver.problem.plant
     covs = propagate_covariance(plant, steps)
-    prior, ages, loop = make_age_prior(solver, ALLOWED), AgeRecord(), LoopState()
+    shares, ages, loop = solver.age_shares, AgeRecord(), LoopState()
     arrived, noise = draw_run(cell, steps, problem, rng)
     if steps_before:
         silence = 0
         for is_there in draw_arrivals(*(cell.before or (cell.loss, cell.burst)), steps_before, rng):
-            ages, silence = count_age(ages, silence + 1, prior), 0 if is_there else silence + 1
+            ages, silence = count_age(ages, silence + 1, shares), 0 if is_there else silence + 1
     lower, upper = problem.input_set.bounds
     rows, sides, target = problem.state_set.c, problem.state_set.b, problem.target
     x = target - np.array([2.0, 0.0] * plant.n_u)
@@ -182,7 +182,7 @@ def fly(
         for step in range(newest, k):
             mean = plant.a @ mean + plant.b @ inputs[step]
         if k and adapts:
-            ages = count_age(ages, before + 1, prior)
+            ages = count_age(ages, before + 1, shares)
             variances = np.einsum("mi,ij,mj->m", rows, covs[age], rows)
             is_behind = age >= HORIZON
             risk = compute_outside_risk(sides - rows @ mean, variances, spread.spread)
@@ -192,11 +192,10 @@ def fly(
         if is_new and age < HORIZON:
             preview = Preview(age=age, cov=covs[age] if age else None)
             if adapts:
-                link = ages.link if budgets == "observed" else None
                 preview = Preview(
                     age=age,
                     cov=preview.cov,
-                    level=CERTIFICATE_LEVEL if link is None else get_observed_level(link),
+                    level=ages.level if budgets == "observed" else CERTIFICATE_LEVEL,
                     widening=loop.widening,
                     silence_widening=loop.silence_widening,
                 )
@@ -230,7 +229,7 @@ def main() -> None:
         make_problem(given.axes),
         bernoulli(np.array([1.0 - given.design])),
         ALLOWED,
-        has_lower_levels=adapts,
+        has_observed_levels=adapts,
         bounds_slack=not adapts,
     )
     sys.stdout.write(f"| cell | first {SETTLED} steps outside | after | cost |\n|---|---|---|---|\n")

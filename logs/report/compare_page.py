@@ -20,7 +20,7 @@ from logs.report.compare_text import (
     format_parameter,
     format_value,
 )
-from logs.report.page import Mark, Part, Section, render_facts, render_list, render_page, render_table
+from logs.report.page import Mark, PageSection, Part, render_facts, render_list, render_page, render_table
 from uavctl.errors import UsageError
 
 _MAX_COMPARED_COLUMNS = 2  # more columns would not fit on paper
@@ -120,16 +120,16 @@ def _show_parameters(view: ComparisonView) -> Iterator[Part]:
         yield render_table(["parameter", *view.names], rows, frozenset())
 
 
-SECTIONS: tuple[Section[ComparisonView], ...] = (
-    Section("How alike they are", _describe_likeness),
-    Section("Recordings", _show_recordings),
-    Section("Path", lambda view: overlays.draw_paths(view.flights), legend=_list_marks),
-    Section(
+SECTIONS: tuple[PageSection[ComparisonView], ...] = (
+    PageSection("How alike they are", _describe_likeness),
+    PageSection("Recordings", _show_recordings),
+    PageSection("Path", lambda view: overlays.draw_paths(view.flights), legend=_list_marks),
+    PageSection(
         "Positions and age",
         _draw_flights_over_time,
         note="Time counts from each flight's first tick. Positions are the true ones where they are known.",
         legend=lambda view: (*_list_marks(view), Mark("dotted", "muted", "horizon H")),
     ),
-    Section("Figures", _show_figures),
-    Section("Parameters that differ", _show_parameters, otherwise="None."),
+    PageSection("Figures", _show_figures),
+    PageSection("Parameters that differ", _show_parameters, empty_text="None."),
 )

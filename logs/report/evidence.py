@@ -86,7 +86,7 @@ class FlightEvidence:
 
     @cached_property
     def battery_faults(self) -> tuple[Finding, ...]:
-        """Findings on a battery that gave in while armed."""
+        """Findings on a battery that failed while armed."""
         return tuple(find_battery_faults(*self.battery_v))
 
     @cached_property

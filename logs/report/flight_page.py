@@ -16,7 +16,7 @@ from logs.report import figures, link_figures, origin_sections, plan_figures, pl
 from logs.report.cursor import render_cursor_script
 from logs.report.evidence import FlightEvidence
 from logs.report.headline import derive_headline
-from logs.report.page import Mark, Part, Section, render_facts, render_list, render_note, render_page, render_table
+from logs.report.page import Mark, PageSection, Part, render_facts, render_list, render_note, render_page, render_table
 from logs.report.path_3d import can_draw_path_3d, draw_path_3d
 from logs.report.summary_text import describe_flight, describe_part_begin
 from logs.report.timeline import describe_lanes, draw_timeline, list_hidden_texts
@@ -149,7 +149,7 @@ def _show_events(e: FlightEvidence) -> Iterator[Part]:
         for (severity, code, _), events in events_by_kind.items()
     ]
     if rows:
-        yield render_table(("first at [s]", "severity", "event", "times", "as first told"), rows, frozenset({0, 3}))
+        yield render_table(("first at [s]", "severity", "event", "times", "first text"), rows, frozenset({0, 3}))
 
 
 def _show_summary(e: FlightEvidence) -> Iterator[Part]:
@@ -158,9 +158,9 @@ def _show_summary(e: FlightEvidence) -> Iterator[Part]:
     yield render_facts([*list_summary_rows(e.summary), *verdict_rows])
 
 
-SECTIONS: tuple[Section[FlightEvidence], ...] = (
-    Section("Timeline", _show_timeline, legend=lambda e: list_hidden_texts(e.flight)),
-    Section(
+SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
+    PageSection("Timeline", _show_timeline, legend=lambda e: list_hidden_texts(e.flight)),
+    PageSection(
         "Path",
         _draw_paths,
         legend=(
@@ -179,7 +179,7 @@ SECTIONS: tuple[Section[FlightEvidence], ...] = (
             Mark("cross", "limit", "furthest outside", when=lambda e: e.excursions),
         ),
     ),
-    Section(
+    PageSection(
         "Each axis against its limits",
         lambda e: plots.draw_axes_over_time(e.flight),
         note="The band along a limit is the largest reserve that the plan of the moment kept from it.",
@@ -193,7 +193,7 @@ SECTIONS: tuple[Section[FlightEvidence], ...] = (
             _FALLBACK,
         ),
     ),
-    Section(
+    PageSection(
         "Inputs",
         lambda e: figures.draw_inputs(e.flight),
         note="The colour tells how far into its plan the controller was when it gave the input: from blue, the first "
@@ -204,7 +204,7 @@ SECTIONS: tuple[Section[FlightEvidence], ...] = (
             _FALLBACK,
         ),
     ),
-    Section(
+    PageSection(
         "Age of information",
         _draw_ages,
         note=_explain_age,
@@ -217,14 +217,14 @@ SECTIONS: tuple[Section[FlightEvidence], ...] = (
             _FALLBACK,
         ),
     ),
-    Section(
+    PageSection(
         "The link, estimated against promised",
         _show_link,
         note=_explain_link,
         legend=(Mark("line", "estimate", "measured"), Mark("dashed", "limit", "promised"), _HORIZON),
         is_closed=True,
     ),
-    Section(
+    PageSection(
         "Plans against what was flown",
         _draw_plans,
         note="A few plans on the way to the target, each with the back-off that it keeps from a limit at that stage.",
@@ -234,28 +234,28 @@ SECTIONS: tuple[Section[FlightEvidence], ...] = (
             Mark("planned", "plan", "plan, from its first state"),
             Mark("band", "plan", "back-off of the plan"),
         ),
-        otherwise=_NO_PLAN,
+        empty_text=_NO_PLAN,
         is_closed=True,
     ),
-    Section(
+    PageSection(
         "Certificates and slack",
         lambda e: plan_figures.draw_certificates(e.flight),
         note=_explain_certificates,
         legend=lambda e: (Mark("dot", role, name) for name, role in plan_figures.list_methods(e.flight)),
-        otherwise=_NO_PLAN,
+        empty_text=_NO_PLAN,
         is_closed=True,
     ),
-    Section(
+    PageSection(
         "Time taken",
         lambda e: figures.draw_timing(e.flight),
         note=_explain_timing,
-        otherwise="No times were measured in this flight.",
+        empty_text="No times were measured in this flight.",
         is_closed=True,
     ),
     *verdict_sections.SECTIONS,
     *origin_sections.SECTIONS,
-    Section("Events", _show_events, otherwise="There were none."),
-    Section("Summary", _show_summary),
+    PageSection("Events", _show_events, empty_text="There were none."),
+    PageSection("Summary", _show_summary),
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from logs.report.evidence import FlightEvidence
-from logs.report.page import Part, Section, render_facts, render_folded, render_table
+from logs.report.page import PageSection, Part, render_facts, render_folded, render_table
 
 # Numbers that say no more than that it hardly ever happens are told as one.
 _NEGLIGIBLE = 1e-6
@@ -80,7 +80,7 @@ def _list_assumptions(design: Mapping[str, object]) -> Iterator[tuple[str, ...]]
             )
 
 
-SECTIONS: tuple[Section[FlightEvidence], ...] = (
-    Section("Configuration and parameters", _show_configuration, is_closed=True),
-    Section("Made with", _show_versions, is_closed=True),
+SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
+    PageSection("Configuration and parameters", _show_configuration, is_closed=True),
+    PageSection("Made with", _show_versions, is_closed=True),
 )

@@ -48,7 +48,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Section(Generic[View]):
+class PageSection(Generic[View]):
     """One row of a page's list: a title, what stands below it, and when the page has it.
 
     Attributes:
@@ -57,7 +57,7 @@ class Section(Generic[View]):
         when: Returns whether the page of a view has this section.
         note: How to read it.
         legend: Meaning of the marks, shown where the section has a figure.
-        otherwise: Sentence where there are no parts; without one, such a section is left out.
+        empty_text: Sentence where there are no parts; without one, such a section is left out.
         is_closed: It is behind its title until it is opened, as what is rarely looked at.
     """
 
@@ -66,7 +66,7 @@ class Section(Generic[View]):
     when: Callable[[View], object] = is_always_shown
     note: str | Callable[[View], str] = ""
     legend: Iterable[Mark] | Callable[[View], Iterable[Mark]] = ()
-    otherwise: str = ""
+    empty_text: str = ""
     is_closed: bool = False
 
 
@@ -86,19 +86,21 @@ class _FilledSection:
         return "on-" + re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
-def _fill_sections(sections: Iterable[Section[View]], view: View) -> Iterator[_FilledSection]:
+def _fill_sections(sections: Iterable[PageSection[View]], view: View) -> Iterator[_FilledSection]:
     for section in sections:
         if not section.when(view):
             continue
         parts = list(section.parts(view))
-        if not parts and not section.otherwise:
+        if not parts and not section.empty_text:
             continue
         note = section.note if isinstance(section.note, str) else section.note(view)
         legend: tuple[Mark, ...] = ()
         if any(isinstance(part, Drawing) for part in parts):
             marks = section.legend(view) if callable(section.legend) else section.legend
             legend = tuple(mark for mark in marks if mark.when(view))
-        yield _FilledSection(section.title, note, render_parts(parts or [section.otherwise]), legend, section.is_closed)
+        yield _FilledSection(
+            section.title, note, render_parts(parts or [section.empty_text]), legend, section.is_closed
+        )
 
 
 @cache
@@ -120,7 +122,7 @@ def _render_macro(macro: str, *arguments: object) -> Markup:
 def render_page(
     title: str,
     subtitle: str,
-    sections: Iterable[Section[View]],
+    sections: Iterable[PageSection[View]],
     view: View,
     banner: Banner | None = None,
     script: str = "",

@@ -11,7 +11,16 @@ from logs.recording.design_view import AXIS_NUMBER
 from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, format_rate, list_facts
 from logs.recording.output_files import write_atomically
 from logs.report.figures import thin_keeping_largest
-from logs.report.page import Mark, Part, Section, render_facts, render_folded, render_list, render_page, render_table
+from logs.report.page import (
+    Mark,
+    PageSection,
+    Part,
+    render_facts,
+    render_folded,
+    render_list,
+    render_page,
+    render_table,
+)
 from logs.report.plots import DISPLAY_AXES, DOTTED, PATH_VIEWS, RATE_NAMES, has_variation, thin_path, thin_samples
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from logs.report.tlog_headline import derive_tlog_headline
@@ -213,37 +222,37 @@ _SETPOINT = Mark(
     "setpoint",
     when=lambda flight: np.isfinite(flight.setpoint_m).any() or np.isfinite(flight.setpoint_mps).any(),
 )
-SECTIONS: tuple[Section[MavlinkFlight], ...] = (
-    Section("Path", _draw_paths, when=_has_place, legend=_MARKS),
-    Section(
+SECTIONS: tuple[PageSection[MavlinkFlight], ...] = (
+    PageSection("Path", _draw_paths, when=_has_place, legend=_MARKS),
+    PageSection(
         "Axes over time",
         _draw_axes,
         when=_has_place,
         note="Time counts from the recording's begin. All is in local NED, height upwards.",
         legend=(*_MARKS, _SETPOINT),
     ),
-    Section(
+    PageSection(
         "Height",
         _draw_height,
         when=lambda flight: not _has_place(flight) and has_variation(flight.height_m),
-        note="It told no place, and its height alone.",
+        note="The vehicle reported its height, but no position.",
     ),
-    Section("Battery", _draw_battery, when=lambda flight: has_variation(flight.battery_v)),
-    Section("Attitude", _draw_attitude),
-    Section(
+    PageSection("Battery", _draw_battery, when=lambda flight: has_variation(flight.battery_v)),
+    PageSection("Attitude", _draw_attitude),
+    PageSection(
         "Age of positions",
         _draw_ages,
         note="The age of the newest position grows until another one arrives. Its source's clock is not known: ages "
         "are those beyond the quickest position of the last ten seconds.",
     ),
-    Section(
+    PageSection(
         "Acceleration setpoints",
         _draw_setpoints,
         when=lambda flight: flight.info.setpoints,
-        otherwise="They ask for no acceleration that changes.",
+        empty_text="They ask for no acceleration that changes.",
     ),
-    Section("Modes", _show_modes, otherwise="There are none."),
-    Section("Texts of the vehicle", _show_texts),
-    Section("What is in it", _show_contents),
-    Section("Summary", _show_summary),
+    PageSection("Modes", _show_modes, empty_text="There are none."),
+    PageSection("Texts of the vehicle", _show_texts),
+    PageSection("What is in it", _show_contents),
+    PageSection("Summary", _show_summary),
 )

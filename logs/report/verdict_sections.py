@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from logs.report import verdict_figures
 from logs.report.evidence import FlightEvidence
-from logs.report.page import Mark, Part, Section, render_folded, render_note, render_table
+from logs.report.page import Mark, PageSection, Part, render_folded, render_note, render_table
 from logs.report.statistics import LEVEL
 from logs.report.verdict_clocks import ClockVerdict, format_plain
 from logs.report.verdict_model import AxisVerdict, LeadVerdict, ModelOutcome, ModelVerdict
@@ -160,8 +160,8 @@ def _format_p_value(value: float) -> str:
     return f"{value:.2g}" if value >= 1e-4 else "< 0.0001"
 
 
-SECTIONS: tuple[Section[FlightEvidence], ...] = (
-    Section(
+SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
+    PageSection(
         "Verdict: promised risk against measured",
         _show_risk,
         note="“outside” counts all flown steps; “with news” those at which a position had just come, which are "
@@ -170,7 +170,7 @@ SECTIONS: tuple[Section[FlightEvidence], ...] = (
         "inputs, at once.",
         is_closed=True,
     ),
-    Section(
+    PageSection(
         "Verdict: the model against what was flown",
         _show_model,
         note="The flight's filter is run again over all positions it used, in the order of capture. An error is a "
@@ -184,11 +184,11 @@ SECTIONS: tuple[Section[FlightEvidence], ...] = (
         ),
         is_closed=True,
     ),
-    Section(
+    PageSection(
         "Verdict: clocks",
         _show_clocks,
         note="The age of information is only as true as the times of capture, which come from the clocks of others.",
-        otherwise="No connection told anything of its clock.",
+        empty_text="No connection reported a clock.",
         is_closed=True,
     ),
 )

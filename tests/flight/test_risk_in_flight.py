@@ -20,7 +20,7 @@ from uavctl.flight.tick import tick as run_tick
 from uavctl.records import Plan, RiskRecord, StepInput, Vec3
 from uavctl.smpc.answer import Preview, QuestionError
 from uavctl.smpc.conditioned.adaptation import MAX_WIDENING, AgeRecord, LoopState, charge_risk, count_age
-from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_link, get_observed_level
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_link
 from uavctl.wiring.controller import build_conditioned, build_controller
 
 STEPS = 300
@@ -79,10 +79,6 @@ def flight() -> tuple[list[StepInput], list[TickOutput]]:
     return fly(load_room(), 1)
 
 
-def find_level(record: AgeRecord) -> int:
-    return CERTIFICATE_LEVEL if record.link is None else get_observed_level(record.link)
-
-
 def test_a_replay_decides_the_same_with_the_same_risk(flight: tuple[list[StepInput], list[TickOutput]]) -> None:
     inputs, outputs = flight
     assert run(build_controller(load_room()), inputs) == outputs
@@ -102,15 +98,11 @@ def test_level_and_spread_follow_from_the_recorded_counts_alone(
         if risk is not None:
             keeps_away = plans.get("flown", 0.0) > 0.0
             assert risk.outside is not None
-            ages = count_age(ages, risk.age, parameters.prior)
+            ages = count_age(ages, risk.age, parameters.shares)
             loop = charge_risk(
-                loop,
-                risk.outside,
-                parameters.prior.allowed,
-                keeps_away=keeps_away,
-                is_behind_horizon=risk.age > horizon,
+                loop, risk.outside, parameters.allowed, keeps_away=keeps_away, is_behind_horizon=risk.age > horizon
             )
-            assert risk.level == find_level(ages)
+            assert risk.level == ages.level
             assert (risk.widening, risk.silence_widening) == (loop.widening, loop.silence_widening)
         if output.plan is not None:
             plans["flown"] = output.plan.offset
@@ -145,10 +137,10 @@ def test_the_ages_before_the_flight_count() -> None:
     waited = [risk for risk in risks if risk.outside is None]
     record = AgeRecord()
     for risk in waited:
-        record = count_age(record, risk.age, controller.risk.prior)
-        assert (risk.level, risk.widening) == (find_level(record), 1.0)
-    assert record.link is not None
-    assert risks[len(waited)].level == find_level(record)
+        record = count_age(record, risk.age, controller.risk.shares)
+        assert (risk.level, risk.widening) == (record.level, 1.0)
+    assert record.level > CERTIFICATE_LEVEL
+    assert risks[len(waited)].level == record.level
     assert run(build_controller(config), inputs) == outputs
     # The first two seconds, and the first position, are not counted.
     assert ticks - len(waited) == pytest.approx(2.0 / controller.plant.dt_s, abs=3)

@@ -172,7 +172,7 @@ def fly_what_if(request: WhatIfRequest) -> WhatIf:
     with create_recording(request.out, loaded.config.name, before.log) as path, _show_progress() as progress:
         watch = _make_watch(progress, "reproducing the flight")
         reproduced = _reproduce(history, recorded_controller, response, watch)
-        watch = _make_watch(progress, "flying it otherwise")
+        watch = _make_watch(progress, "flying the variant")
         course, status = _record_changed(history, changed_controller, response, other_link, path, recorded, watch)
         progress.add_task("writing the pages", total=None)
         conclude_flight(path, time.perf_counter() - begin_s, status)

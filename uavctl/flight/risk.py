@@ -22,7 +22,7 @@ from uavctl.flight.supervise import Supervised
 from uavctl.records import Event, Plan, RiskRecord, Severity
 from uavctl.smpc.answer import CONFIGURED_LEVEL, Preview
 from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
-from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_observed_level
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL
 
 # The first positions of a source do not show its clock yet: a few round trips take two seconds, and the smallest delay
 # shows itself within as much.
@@ -46,10 +46,8 @@ def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | Non
 
 
 def _select_level(ages: AgeRecord, parameters: RiskParameters) -> int:
-    """Select the level of the budgets: the certificate's, until there is a record that may be used."""
-    if parameters.budgets != "observed" or ages.link is None:
-        return CERTIFICATE_LEVEL
-    return get_observed_level(ages.link)
+    """Select the level of the budgets."""
+    return ages.level if parameters.budgets == "observed" else CERTIFICATE_LEVEL
 
 
 def update_risk(
@@ -79,7 +77,7 @@ def update_risk(
         return RiskGroup(risk.renewed, risk.loop, age_steps, first_ns, risk.renewed), None
     age = before + 1
     if not is_flown:
-        ages = count_age(risk.ages, age, parameters.prior)
+        ages = count_age(risk.ages, age, parameters.shares)
         renewed = ages if age_steps <= before else risk.renewed
         return RiskGroup(ages, risk.loop, age_steps, first_ns, renewed), _make_record(
             age, None, ages, risk.loop, parameters, spread
@@ -120,10 +118,10 @@ def charge_step(
     """
     assert risk.age_steps is not None, "no position came before"
     age = risk.age_steps + 1
-    ages = count_age(risk.ages, age, parameters.prior)
+    ages = count_age(risk.ages, age, parameters.shares)
     outside = compute_outside_risk(margins, variances, spread)
     loop = charge_risk(
-        risk.loop, outside, parameters.prior.allowed, keeps_away=keeps_away, is_behind_horizon=age_steps >= horizon
+        risk.loop, outside, parameters.allowed, keeps_away=keeps_away, is_behind_horizon=age_steps >= horizon
     )
     renewed = ages if age_steps <= risk.age_steps else risk.renewed
     return RiskGroup(ages, loop, age_steps, risk.first_ns, renewed), outside

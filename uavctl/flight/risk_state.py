@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import msgspec
 
 from uavctl.arrays import Array
-from uavctl.smpc.conditioned.adaptation import AgePrior, AgeRecord, LoopState
+from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState
 
 
 @dataclass(frozen=True, eq=False)
 class RiskParameters:
     """Parameters of the risk in flight."""
 
-    prior: AgePrior  # configured link, and the allowed risk
+    allowed: float  # α = 1 - δ_x
+    shares: Array  # π_t (H+1,) of the configured link, the last one of all older ages
     rows: Array  # state rows C (m, n_x)
     budgets: str  # `certificate`, or `observed`: they follow the link
     adapts: bool  # whether the deviations follow the risk as observed

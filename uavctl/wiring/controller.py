@@ -29,7 +29,7 @@ from uavctl.flight.yaw import YawMode, YawParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conditioned.design import AnyDesign, ConditionedDesign, make_conditioned_id, make_conditioned_record
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_age_prior
+from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
@@ -203,7 +203,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
         slew_mps3=slew_mps3,
         cov=cov,
         filter_plant=estimator_plant,
-        has_lower_levels=adapts,
+        has_observed_levels=adapts,
         bounds_slack=bounds_slack,
     )
     design_id = make_conditioned_id(
@@ -390,8 +390,13 @@ def _build_risk(config: Config, design: AnyDesign) -> RiskParameters | None:
     risk = config.risk
     if not isinstance(design, ConditionedDesign) or risk.budgets == "configured":
         return None
-    prior = make_age_prior(design.solver, 1.0 - config.smpc.delta_x)
-    return RiskParameters(prior, design.state_set.c, risk.budgets, risk.adapt)
+    return RiskParameters(
+        allowed=1.0 - config.smpc.delta_x,
+        shares=design.solver.age_shares,
+        rows=design.state_set.c,
+        budgets=risk.budgets,
+        adapts=risk.adapt,
+    )
 
 
 def build_controller(config: Config, design: AnyDesign | None = None) -> Controller:

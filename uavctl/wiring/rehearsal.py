@@ -24,7 +24,7 @@ from uavctl.flight.risk import set_risk
 from uavctl.flight.risk_state import RiskGroup
 from uavctl.records import Vector
 from uavctl.smpc.answer import Preview
-from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, find_prior_link
+from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, find_configured_level
 from uavctl.smpc.conditioned.design import ConditionedDesign
 from uavctl.smpc.plant import AXES, Plant
 from uavctl.wiring.controller import build_plant, make_start_state
@@ -152,7 +152,7 @@ def _fly_mission(
     late_steps = _sample_late_steps(config, design)
     risk = RiskGroup()
     if controller.risk is not None:  # as after a long flight on the configured link
-        ages = AgeRecord(link=find_prior_link(controller.risk.prior))
+        ages = AgeRecord(level=find_configured_level(controller.risk.shares))
         risk = RiskGroup(ages, LoopState(log_silence_widening=0.0))
     steps = min(MAX_STEPS, round(config.duration_s / plant.dt_s) if motion is None else len(motion.states))
     last_input, state = np.zeros(plant.n_u), None

@@ -14,7 +14,7 @@ from campaign_results import cell, runs, write
 from report_rig import omit_figures
 from text_numbers import find_numbers
 
-from logs.report.page import Section, render_page
+from logs.report.page import PageSection, render_page
 from logs.report.run_statistics import PairedDifference
 from logs.report.svg import Drawing
 from uavctl.errors import UavctlError
@@ -282,7 +282,7 @@ def test_a_legend_has_the_markers_of_its_figure() -> None:
     entries = list(looks.make_marks(looks.controllers))
     assert len({(entry.role, entry.path, entry.full) for entry in entries}) == 12
     drawn = re.findall(
-        r"<li>.*?</li>", render_page("", "", [Section("", lambda _: [Drawing("", "", "")], legend=entries)], None)
+        r"<li>.*?</li>", render_page("", "", [PageSection("", lambda _: [Drawing("", "", "")], legend=entries)], None)
     )
     assert len({re.sub(r"controller \d+", "", label) for label in drawn}) == 12
     assert all(

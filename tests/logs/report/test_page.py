@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from logs.report import page
 from logs.report.findings import Banner
-from logs.report.page import Mark, MarkKind, Part, Section
+from logs.report.page import Mark, MarkKind, PageSection, Part
 from logs.report.svg import Drawing
 
 HOSTILE = "<script>alert('1')</script> & \"it\" &amp;"
@@ -21,7 +21,7 @@ DRAWING = Drawing("one", '<svg viewBox="0 0 1 1"></svg>', HOSTILE)
 
 def make_html(*parts: Part, title: str = "a", banner: Banner | None = None, **fields: Any) -> str:
     """A page with one section."""
-    return page.render_page(title, title, [Section(title, lambda _: parts, **fields)], None, banner)
+    return page.render_page(title, title, [PageSection(title, lambda _: parts, **fields)], None, banner)
 
 
 PARTS: dict[str, Callable[[str], str]] = {
@@ -36,8 +36,8 @@ PARTS: dict[str, Callable[[str], str]] = {
     "folded": lambda text: page.render_folded(text, text),
     "folded around HTML": lambda text: page.render_folded(text, page.render_note(text)),
     "page": lambda text: make_html(DRAWING, title=text, note=text, legend=[Mark("line", "plan", text)]),
-    "otherwise": lambda text: make_html(otherwise=text),
-    "contents": lambda text: page.render_page("t", "s", [Section(text, lambda _: ["a"])] * 9, None),
+    "otherwise": lambda text: make_html(empty_text=text),
+    "contents": lambda text: page.render_page("t", "s", [PageSection(text, lambda _: ["a"])] * 9, None),
 }
 
 
@@ -58,8 +58,8 @@ def test_a_sentence_that_nobody_has_marked_as_html_is_text() -> None:
 
 def test_a_section_is_left_out_without_parts_and_where_its_condition_is_false() -> None:
     assert "<section>" not in make_html()
-    assert "<section>" not in make_html("a", when=lambda _: False, otherwise="nothing")
-    assert "<p>nothing</p>" in make_html(otherwise="nothing")
+    assert "<section>" not in make_html("a", when=lambda _: False, empty_text="nothing")
+    assert "<p>nothing</p>" in make_html(empty_text="nothing")
 
 
 def test_a_legend_stands_with_figures_and_has_the_marks_whose_condition_holds() -> None:
@@ -76,7 +76,7 @@ def test_neighbouring_figures_share_a_grid() -> None:
 @pytest.mark.parametrize("sections", [8, 9])
 def test_a_long_page_has_links_to_its_sections(sections: int) -> None:
     titles = [f"Section {number}: x & y" for number in range(sections)]
-    html = page.render_page("t", "s", [Section(title, lambda _: ["a"]) for title in titles], None)
+    html = page.render_page("t", "s", [PageSection(title, lambda _: ["a"]) for title in titles], None)
     links = re.findall(r'<a href="#([^"]+)">', html)
     assert len(links) == (0 if sections == 8 else 9)
     assert set(links) <= set(re.findall(r'<h2 id="([^"]+)">', html))

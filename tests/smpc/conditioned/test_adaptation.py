@@ -11,9 +11,9 @@ from uavctl.arrays import Array
 from uavctl.config.load import load_config
 from uavctl.smpc.answer import Preview, QuestionError
 from uavctl.smpc.conditioned import adaptation
-from uavctl.smpc.conditioned.adaptation import AgePrior, AgeRecord, LoopState, charge_risk, count_age
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_age_prior
-from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_link, get_observed_level
+from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, count_age
+from uavctl.smpc.conditioned.planner import ConditionedSolver
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_link
 from uavctl.smpc.link import bernoulli
 from uavctl.wiring.controller import build_problem
 
@@ -25,13 +25,13 @@ LOSS = 0.3
 def solver() -> ConditionedSolver:
     problem = build_problem(load_config("paper", ["smpc.scheme=age-conditioned", "target.position_m=[0, 19, 0]"]))
     return ConditionedSolver(
-        problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_lower_levels=True, bounds_slack=False
+        problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_observed_levels=True, bounds_slack=False
     )
 
 
 @pytest.fixture(scope="module")
-def prior(solver: ConditionedSolver) -> AgePrior:
-    return make_age_prior(solver, ALLOWED)
+def shares(solver: ConditionedSolver) -> Array:
+    return solver.age_shares
 
 
 def draw_ages(steps: int, loss: float, burst: float, seed: int) -> list[int]:
@@ -46,16 +46,15 @@ def draw_ages(steps: int, loss: float, burst: float, seed: int) -> list[int]:
     return ages
 
 
-def record_ages(ages: list[int], prior: AgePrior, record: AgeRecord | None = None) -> AgeRecord:
+def record_ages(ages: list[int], shares: Array, record: AgeRecord | None = None) -> AgeRecord:
     record = record or AgeRecord()
     for age in ages:
-        record = count_age(record, age, prior)
+        record = count_age(record, age, shares)
     return record
 
 
 def get_observed_link(record: AgeRecord) -> tuple[float, float]:
-    assert record.link is not None
-    return get_link(get_observed_level(record.link))
+    return get_link(record.level)
 
 
 def test_the_certificate_keeps_the_allowed_risk_on_any_link(solver: ConditionedSolver) -> None:
@@ -69,20 +68,20 @@ def test_without_a_level_a_plan_is_that_of_the_configured_link(solver: Condition
     plain = ConditionedSolver(solver.problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, bounds_slack=False)
     assert plain.solve(0, state, target).inputs.tobytes() == solver.solve(0, state, target).inputs.tobytes()
     with pytest.raises(QuestionError, match="level"):
-        plain.solve(0, state, target, Preview(level=get_observed_level(0)))
+        plain.solve(0, state, target, Preview(level=1))
 
 
-def test_a_record_begins_with_the_certificate(prior: AgePrior) -> None:
-    assert AgeRecord().link is None
-    assert record_ages(draw_ages(adaptation.REVIEW_STEPS - 1, LOSS, 1.0, 1), prior).link is None
+def test_a_record_begins_with_the_certificate(shares: Array) -> None:
+    assert AgeRecord().level == CERTIFICATE_LEVEL
+    assert record_ages(draw_ages(adaptation.REVIEW_STEPS - 1, LOSS, 1.0, 1), shares).level == CERTIFICATE_LEVEL
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.1, 1.0), (0.3, 1.0), (0.3, 3.0), (0.6, 1.0), (0.6, 5.0), (0.8, 10.0)])
-def test_bounds_of_a_long_record_are_above_the_link_and_near_it(prior: AgePrior, loss: float, burst: float) -> None:
+def test_bounds_of_a_long_record_are_above_the_link_and_near_it(shares: Array, loss: float, burst: float) -> None:
     first_loss = loss if burst == 1.0 else loss / (burst * (1.0 - loss))
     continuation = loss if burst == 1.0 else 1.0 - 1.0 / burst
     bounds = np.array(
-        [adaptation.bound_link(record_ages(draw_ages(1500, loss, burst, seed), prior).counts) for seed in range(60)]
+        [adaptation.bound_link(record_ages(draw_ages(1500, loss, burst, seed), shares).counts) for seed in range(60)]
     )
     for found, true in zip(bounds.T, (first_loss, continuation), strict=True):
         odds, true_odds = found / (1.0 - found), true / (1.0 - true)
@@ -90,22 +89,22 @@ def test_bounds_of_a_long_record_are_above_the_link_and_near_it(prior: AgePrior,
         assert 1.0 < np.median(odds) / true_odds < 2.0
 
 
-def test_few_steps_of_a_good_link_do_not_rule_out_long_runs(prior: AgePrior) -> None:
-    _, continuation = adaptation.bound_link(record_ages([1] * 30, prior).counts)
+def test_few_steps_of_a_good_link_do_not_rule_out_long_runs(shares: Array) -> None:
+    _, continuation = adaptation.bound_link(record_ages([1] * 30, shares).counts)
     assert continuation > 0.8
 
 
-def test_a_record_follows_a_link_that_changes(prior: AgePrior) -> None:
-    before = record_ages(draw_ages(3000, LOSS, 1.0, 3), prior)
-    after = record_ages(draw_ages(500, 0.6, 1.0, 3), prior, before)
+def test_a_record_follows_a_link_that_changes(shares: Array) -> None:
+    before = record_ages(draw_ages(3000, LOSS, 1.0, 3), shares)
+    after = record_ages(draw_ages(500, 0.6, 1.0, 3), shares, before)
     assert get_observed_link(before) == (0.3, 0.3)
     assert min(get_observed_link(after)) >= 0.55
-    assert get_observed_link(record_ages(draw_ages(2000, LOSS, 1.0, 4), prior, after)) == (0.3, 0.3)
+    assert get_observed_link(record_ages(draw_ages(2000, LOSS, 1.0, 4), shares, after)) == (0.3, 0.3)
 
 
-def test_positions_that_are_late_are_no_losses(prior: AgePrior) -> None:
+def test_positions_that_are_late_are_no_losses(shares: Array) -> None:
     late = [age + 2 for age in draw_ages(3000, LOSS, 1.0, 3)]
-    assert get_observed_link(record_ages(late, prior)) == (0.3, 0.3)
+    assert get_observed_link(record_ages(late, shares)) == (0.3, 0.3)
 
 
 def simulate_loop(risk_of_widening: float, steps: int) -> tuple[LoopState, float]:

@@ -22,8 +22,7 @@ from uavctl.smpc.conditioned.adaptation import (
     count_innovation,
 )
 from uavctl.smpc.conditioned.backoffs import RowDeviations
-from uavctl.smpc.conditioned.planner import ConditionedSolver, make_age_prior
-from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, get_observed_level
+from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import find_parts, propagate_covariance
 from uavctl.wiring.controller import build_problem
@@ -49,7 +48,7 @@ def make_solver(target: str) -> ConditionedSolver:
     config = load_config("paper", ["smpc.scheme=age-conditioned", f"target.position_m={target}"])
     problem = build_problem(config)
     return ConditionedSolver(
-        problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_lower_levels=True, bounds_slack=False
+        problem, bernoulli(np.array([1.0 - LOSS])), ALLOWED, has_observed_levels=True, bounds_slack=False
     )
 
 
@@ -59,7 +58,7 @@ def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapt
     covs, rows, sides = propagate_covariance(plant, STEPS), problem.state_set.c, problem.state_set.b
     arrived = rng.random(STEPS) >= LOSS
     disturbances = draw_disturbances(kind, STEPS, rng) @ np.linalg.cholesky(plant.w).T
-    prior, ages, loop = make_age_prior(solver, ALLOWED), AgeRecord(), LoopState()
+    shares, ages, loop = solver.age_shares, AgeRecord(), LoopState()
     x, mean, newest, outside = problem.target.copy(), problem.target.copy(), 0, np.zeros(STEPS)
     plan, spread, places = solver.solve(0, x, problem.target), SpreadState(), list(plant.position_index)
     for k in range(STEPS):
@@ -70,17 +69,13 @@ def fly(solver: ConditionedSolver, kind: str, rng: np.random.Generator, *, adapt
                 spread = count_innovation(spread, (x - mean)[places].tolist(), expected.tolist())
                 newest, mean = k, x
             age = k - newest
-            ages = count_age(ages, before + 1, prior)
+            ages = count_age(ages, before + 1, shares)
             variances = np.einsum("mi,ij,mj->m", rows, covs[age], rows)
             is_behind = age >= horizon
             risk = compute_outside_risk(sides - rows @ mean, variances, spread.spread)
             loop = charge_risk(loop, risk, ALLOWED, keeps_away=plan.offset > 0.0, is_behind_horizon=is_behind)
             if arrived[k]:
-                preview = Preview(
-                    level=CERTIFICATE_LEVEL if ages.link is None else get_observed_level(ages.link),
-                    widening=loop.widening,
-                    silence_widening=loop.silence_widening,
-                )
+                preview = Preview(level=ages.level, widening=loop.widening, silence_widening=loop.silence_widening)
                 plan = solver.solve(k, x, problem.target, preview if adapts else Preview())
         u = plan.inputs[min(k - newest, horizon - 1)]
         x = plant.a @ x + plant.b @ u + plant.e @ disturbances[k]

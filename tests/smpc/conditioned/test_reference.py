@@ -15,15 +15,7 @@ from other_links import fly as fly_scheme
 from uavctl.arrays import Array
 from uavctl.smpc.answer import CONFIGURED_LEVEL, Preview, QuestionError
 from uavctl.smpc.conditioned.planner import ConditionedSolver
-from uavctl.smpc.conditioned.reference import (
-    CERTIFICATE_LEVEL,
-    CONTINUATIONS,
-    FIRST_LOSSES,
-    LAST_LEVEL,
-    find_nearest_link,
-    get_link,
-    get_observed_level,
-)
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, LAST_LEVEL, find_nearest_level, get_link
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.nominal import lqr
 from uavctl.smpc.sets import Polytope
@@ -77,9 +69,9 @@ def test_its_regulator_is_outside_as_often_as_allowed_and_costs_less_than_one_di
 
 def test_worse_links_keep_further_away_and_no_distance_falls_with_age() -> None:
     program = make_reference_program()
-    for i in range(len(FIRST_LOSSES) * len(CONTINUATIONS)):
-        link = get_link(get_observed_level(i))
-        assert find_nearest_link(*link) == i
+    for level in range(CERTIFICATE_LEVEL + 1, LAST_LEVEL + 1):
+        link = get_link(level)
+        assert find_nearest_level(*link) == level
         distances = program.find_distances(link, ALLOWED)
         assert distances[0] > 0.0
         assert (np.diff(distances) >= 0.0).all()
@@ -90,15 +82,14 @@ def test_worse_links_keep_further_away_and_no_distance_falls_with_age() -> None:
 
 
 def test_links_beyond_the_levels_get_the_nearest_one() -> None:
-    last = len(FIRST_LOSSES) * len(CONTINUATIONS) - 1
-    assert (find_nearest_link(0.0, 0.0), find_nearest_link(1.0, 1.0)) == (0, last)
+    assert (find_nearest_level(0.0, 0.0), find_nearest_level(1.0, 1.0)) == (CERTIFICATE_LEVEL + 1, LAST_LEVEL)
 
 
 def test_rows_that_nothing_disturbs_need_no_distance() -> None:
     problem = make_problem(1)
     calm = replace(problem, plant=replace(problem.plant, w=0.0 * problem.plant.w))
-    solver = ConditionedSolver(calm, bernoulli(np.array([0.7])), ALLOWED, has_lower_levels=True, bounds_slack=False)
-    answer = solver.solve(0, calm.target, calm.target, Preview(level=get_observed_level(50)))
+    solver = ConditionedSolver(calm, bernoulli(np.array([0.7])), ALLOWED, has_observed_levels=True, bounds_slack=False)
+    answer = solver.solve(0, calm.target, calm.target, Preview(level=51))
     assert answer.offset == 0.0
     assert not answer.inputs.any()
 
@@ -106,7 +97,7 @@ def test_rows_that_nothing_disturbs_need_no_distance() -> None:
 @pytest.fixture(scope="module")
 def solver() -> ConditionedSolver:
     link = bernoulli(np.array([0.7]))
-    return ConditionedSolver(make_problem(2), link, ALLOWED, has_lower_levels=True, bounds_slack=False)
+    return ConditionedSolver(make_problem(2), link, ALLOWED, has_observed_levels=True, bounds_slack=False)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -116,7 +107,7 @@ def test_a_plan_is_the_nearest_to_the_regulator_around_the_references_that_keeps
     """Against CVXPY, from the distances of one wall and of two."""
     rng, problem, program = np.random.default_rng(seed), solver.problem, make_reference_program()
     plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
-    level, age = get_observed_level(int(rng.integers(100))), int(rng.integers(steps - 1))
+    level, age = int(rng.integers(1, LAST_LEVEL + 1)), int(rng.integers(steps - 1))
     f, g = round(float(rng.uniform(0.7, 1.5)), 2), round(float(rng.uniform(1.0, 2.0)), 2)
     target = np.array([WALL_M - 1.0, 0.0, rng.choice([WALL_M - 0.5, -20.0]), 0.0])
     x = target - rng.uniform([0.0, -4.0, 0.0, -4.0], [8.0, 3.0, 8.0, 3.0])
@@ -152,7 +143,7 @@ def test_between_two_near_walls_a_plan_rests_between_them(target: float, level: 
     problem = make_problem(1)
     narrow = replace(problem, state_set=Polytope.from_box([15.0, -8.0], [WALL_M, 8.0]))
     link = bernoulli(np.array([0.7]))
-    solver = ConditionedSolver(narrow, link, ALLOWED, has_lower_levels=True, bounds_slack=False)
+    solver = ConditionedSolver(narrow, link, ALLOWED, has_observed_levels=True, bounds_slack=False)
     preview = Preview(level=level, widening=4.0, silence_widening=4.0)
     answer = solver.solve(0, np.array([17.0, 0.0]), np.array([target, 0.0]), preview)
     assert answer.reference[0] == pytest.approx(17.5, abs=1e-6)
@@ -181,7 +172,7 @@ def test_the_promise_holds_on_links_of_which_no_design_knows(name: str, axes: in
     """At most 7 % of the first 200 steps are outside, and 5 % after them; 6 runs, three standard errors."""
     (cell,) = (cell for cell in CELLS if cell.name == name)
     link = bernoulli(np.array([0.7]))
-    solver = ConditionedSolver(make_problem(axes), link, ALLOWED, has_lower_levels=True, bounds_slack=False)
+    solver = ConditionedSolver(make_problem(axes), link, ALLOWED, has_observed_levels=True, bounds_slack=False)
     runs = np.array(
         [fly_scheme(solver, cell, 1200, np.random.default_rng([3, run]), "observed")[0] for run in range(6)]
     )

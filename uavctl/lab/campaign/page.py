@@ -14,8 +14,8 @@ from logs.report.findings import Banner
 from logs.report.page import (
     NOTHING,
     Mark,
+    PageSection,
     Part,
-    Section,
     render_facts,
     render_folded,
     render_list,
@@ -266,13 +266,13 @@ def _name_verdict(view: CampaignView, verdict: CampaignVerdict) -> str:
 
 def _make_scene_section(
     view: CampaignView, scene: tuple[str, str], cells: Sequence[CellSummary], index: int
-) -> Section[CampaignView]:
+) -> PageSection[CampaignView]:
     """Make the section on costs and limits in one disturbance and plant."""
     losses = {
         cell.link: cell.link_loss for cell in view.results.cells if cell.link_loss is not None and not cell.refused
     }
     flown = {cell.controller for cell in cells if cell.cost is not None}
-    return Section(
+    return PageSection(
         f"Costs and limits{_make_suffix(view, scene)}",
         lambda view: plots.draw_quantities(cells, losses, view.styles, f"s{index}"),
         note=_INTERVAL_NOTE if index == 0 else "",
@@ -399,30 +399,30 @@ def _explain_failures(view: CampaignView) -> str:
     return "" if total <= _SHOWN_FAILURES else f"The first {_SHOWN_FAILURES} of {total}; runs.parquet has all."
 
 
-def _list_sections(view: CampaignView) -> Iterator[Section[CampaignView]]:
+def _list_sections(view: CampaignView) -> Iterator[PageSection[CampaignView]]:
     """Return the page's list; there is a section on costs and limits for each disturbance and plant."""
-    yield Section("What happened", lambda view: [render_list(describe_outcome(view))])
-    yield Section("What was compared", _show_compared)
-    yield Section(
+    yield PageSection("What happened", lambda view: [render_list(describe_outcome(view))])
+    yield PageSection("What was compared", _show_compared)
+    yield PageSection(
         "Does the SMPC cost less, at equal or lower violation rates?",
         _show_verdicts,
         note="“Yes” where every baseline costs more than the SMPC, or breaks state or input limits more often: none is "
         "as cheap at equal or lower rates. The columns say what each baseline costs, over the SMPC's cost. Less and "
         "more are judged by the intervals of the differences run by run.",
-        otherwise="No SMPC was flown.",
+        empty_text="No SMPC was flown.",
     )
-    yield Section(
+    yield PageSection(
         "What each baseline costs more than the SMPC",
         _draw_differences,
         note="All controllers meet the same disturbances and the same losses, so their costs are subtracted run by "
         "run; the interval is that of the mean difference, over the SMPC's mean cost. Right of zero the SMPC costs "
         "less.",
         legend=_list_baseline_marks,
-        otherwise="There is nothing to compare.",
+        empty_text="There is nothing to compare.",
     )
     for index, (scene, cells) in enumerate(view.cells_by_scene.items()):
         yield _make_scene_section(view, scene, cells, index)
-    yield Section(
+    yield PageSection(
         "Through the room",
         _show_paths,
         when=lambda view: any(cell.beyond_m is not None for cell in view.cells),  # a box of other units has no walls
@@ -430,14 +430,14 @@ def _list_sections(view: CampaignView) -> Iterator[Section[CampaignView]]:
         "second half of a run, median. Beyond a wall: furthest of all runs; negative is the room that was left. Usable "
         "room: share of it in which a plan may rest.",
     )
-    yield Section(
+    yield PageSection(
         "Age of information",
         lambda view: plots.draw_ages(view.cells, view.results),
         note="Every controller meets the same losses, so the ages are those of the link.",
         legend=lambda view: plots.make_age_legend(view.cells),
-        otherwise="No run ended in order.",
+        empty_text="No run ended in order.",
     )
-    yield Section(
+    yield PageSection(
         "All figures",
         _show_cells,
         note="States and inputs outside: share of steps. Settled: second half of the runs. Worst step: share of runs "
@@ -445,4 +445,4 @@ def _list_sections(view: CampaignView) -> Iterator[Section[CampaignView]]:
         "with any: share of runs with a state outside. No plan left: steps in which the SMPC braked. No plan found, "
         "limits eased: decisions. Oldest: largest age in steps.",
     )
-    yield Section("Runs that failed", _show_failures, note=_explain_failures, otherwise="There were none.")
+    yield PageSection("Runs that failed", _show_failures, note=_explain_failures, empty_text="There were none.")

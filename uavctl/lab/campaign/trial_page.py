@@ -13,7 +13,7 @@ from markupsafe import Markup
 from logs.recording.summary import count
 from logs.report.excursion import GRAVE_M
 from logs.report.findings import Banner
-from logs.report.page import NOTHING, Part, Section, render_facts, render_list, render_page, render_table
+from logs.report.page import NOTHING, PageSection, Part, render_facts, render_list, render_page, render_table
 from uavctl.cause import BAD, CAUTION, GOOD
 from uavctl.lab.campaign.page import render_specification, write_html
 from uavctl.lab.campaign.trials import TrialRecord, TrialSummary, summarise_trial
@@ -166,16 +166,16 @@ def _show_failures(view: _TrialView) -> Iterator[Part]:
         yield render_table(("cell", "controller", "where", "why"), rows, frozenset({0}))
 
 
-_SECTIONS: tuple[Section[_TrialView], ...] = (
-    Section("What happened", lambda view: [render_list(_describe_trials(view.cells))]),
-    Section("What was compared", _show_compared, note=_OWN_LOOP_NOTE),
+_SECTIONS: tuple[PageSection[_TrialView], ...] = (
+    PageSection("What happened", lambda view: [render_list(_describe_trials(view.cells))]),
+    PageSection("What was compared", _show_compared, note=_OWN_LOOP_NOTE),
     *(
-        Section(
+        PageSection(
             _SCENARIO_TITLES[scenario],
             partial(_show_scenario, scenario=scenario),
             note=FIGURE_NOTE if index == 0 else "",
         )
         for index, scenario in enumerate(SCENARIO_FIGURES)
     ),
-    Section("Not flown, or failed", _show_failures, otherwise="None."),
+    PageSection("Not flown, or failed", _show_failures, empty_text="None."),
 )

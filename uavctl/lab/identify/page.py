@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from logs.report.page import Part, Section, render_folded, render_list, render_page, render_table
+from logs.report.page import PageSection, Part, render_folded, render_list, render_page, render_table
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from logs.report.verdict_figures import draw_correlation
 from uavctl.config.load import dump_config
@@ -203,15 +203,15 @@ def _draw_loss_runs(identification: Identification) -> Drawing:
     )
 
 
-_SECTIONS: tuple[Section[_IdentifyView], ...] = (
-    Section("What happened", lambda view: [render_list(_describe_fit(view))]),
-    Section(
+_SECTIONS: tuple[PageSection[_IdentifyView], ...] = (
+    PageSection("What happened", lambda view: [render_list(_describe_fit(view))]),
+    PageSection(
         "Response",
         _show_response,
         note="With the dead time below, one for all axes. ± is the standard error with that dead time. The wind is the "
         "standard deviation of an acceleration that is constant over a step.",
     ),
-    Section(
+    PageSection(
         "Dead time and plant",
         _show_dead_time,
         note="The dead time is the likeliest for the whole flight and all axes, its range where the deviance is less "
@@ -219,30 +219,30 @@ _SECTIONS: tuple[Section[_IdentifyView], ...] = (
         "blocks of 8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints "
         "known.",
     ),
-    Section(
+    PageSection(
         f"Motion of the next {R2_AHEAD_S:g} s",
         lambda view: (_draw_motion(name, prediction) for name, prediction in view.axes),
         note="Each dot is a position: how far the vehicle went from there, and how far the model said it would.",
     ),
-    Section(
+    PageSection(
         "Spread ahead",
         _show_spread,
         note="How far positions were from their predictions over that time, divided by the standard deviation σ that "
         "plans keep multiples of: 1 is right, above 1 plans come too near to limits. By the identified configuration, "
         "and by the one before; both without inertial data.",
     ),
-    Section(
+    PageSection(
         "What is left unexplained",
         _draw_residuals,
         note="Each position minus its prediction from those before: with a right model, 95 % are between the lines, "
         "and one does not tell the next (correlations within the band).",
     ),
-    Section(
+    PageSection(
         "Link",
         _draw_link,
         note="Delays by capture stamps and arrival; runs of losses (bars) beside those of independent losses (dots).",
     ),
-    Section(
+    PageSection(
         "Configuration", lambda view: [render_folded("TOML with what was identified", dump_config(view.fit.config))]
     ),
 )

@@ -9,7 +9,7 @@ from logs.report.compare import compare_flights, load_flights
 from logs.report.compare_page import SECTIONS as COMPARISON_SECTIONS
 from logs.report.compare_page import ComparisonView
 from logs.report.findings import Banner
-from logs.report.page import Section, render_page, render_table
+from logs.report.page import PageSection, render_page, render_table
 from uavctl.cause import CAUTION, GOOD
 from uavctl.lab.tune.figures import HoldChange, TuneFigures, compare_holds, list_figure_rows
 
@@ -44,7 +44,7 @@ def render_tune_page(name: str, recordings: tuple[Path, Path], tuned_file: str, 
 
 
 def judge_tuning(figures: TuneFigures) -> Banner:
-    """Return the first line: which flight held its last waypoint better, and what else speaks for or against it."""
+    """Return the first line: which flight held its last waypoint better, and how well each model predicts."""
     before, after = figures.before, figures.after
     change = compare_holds(before, after)
     tone, word = _OUTCOMES[change]
@@ -67,8 +67,8 @@ def judge_tuning(figures: TuneFigures) -> Banner:
 
 
 _COLUMNS = ("", BEFORE, AFTER)
-_SECTIONS: tuple[Section[_TuneView], ...] = (
-    Section(
+_SECTIONS: tuple[PageSection[_TuneView], ...] = (
+    PageSection(
         "Before and after",
         lambda view: [render_table(_COLUMNS, list_figure_rows(view.figures), frozenset({1, 2}), kind="words")],
         note="The prediction of the flight after is that of the model before and of the tuned one: geometric mean of "

@@ -18,7 +18,7 @@ from logs.recording.notes import RecorderNote
 from logs.recording.summary import FlightSummary, list_summary_rows
 from logs.recording.topics import encode
 from logs.report import overlays
-from logs.report.page import Mark, Section, render_list, render_page, render_table
+from logs.report.page import Mark, PageSection, render_list, render_page, render_table
 from sim.vehicle.linear import CACHED_TRANSITIONS
 from uavctl.arrays import Array
 from uavctl.lab.whatif.flight import Entry, RecordedFlight, VehicleResponse
@@ -260,14 +260,14 @@ def _explain_ages(view: _WhatIfView) -> str:
 
 
 _BOTH = tuple(Mark("line", role, name) for role, name in zip(overlays.ROLES, ("recorded", "what-if"), strict=False))
-_SECTIONS: tuple[Section[_WhatIfView], ...] = (
-    Section("What happened", lambda view: [render_list(describe_what_if(view.result))]),
-    Section(
+_SECTIONS: tuple[PageSection[_WhatIfView], ...] = (
+    PageSection("What happened", lambda view: [render_list(describe_what_if(view.result))]),
+    PageSection(
         "Path",
         lambda view: overlays.draw_paths(view.flights),
         legend=(*_BOTH, Mark("dashed", "limit", "limit of the recorded flight")),
     ),
-    Section(
+    PageSection(
         "Motion",
         lambda view: overlays.draw_positions(view.flights, view.other),
         note="Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits "
@@ -279,13 +279,13 @@ _SECTIONS: tuple[Section[_WhatIfView], ...] = (
             Mark("band", "limit", "reserve kept"),
         ),
     ),
-    Section(
+    PageSection(
         "Link",
         lambda view: [overlays.draw_ages(view.flights)],
         note=_explain_ages,
         legend=(*_BOTH, Mark("dotted", "muted", "horizon H")),
     ),
-    Section(
+    PageSection(
         "Side by side",
         lambda view: [render_table(HEADINGS, make_comparison_rows(view.result), frozenset())],
         note="The recorded flight flown again with nothing changed tells whether this version decides as the one that "

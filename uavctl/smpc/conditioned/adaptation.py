@@ -25,14 +25,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.smpc.conditioned.backoffs import compute_violation_risk
-from uavctl.smpc.conditioned.reference import find_nearest_link
+from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, find_nearest_level
 
 # A step this old counts half: 12 s at 20 Hz, so that a record follows a link that changes in a flight
 HALF_LIFE_STEPS = 250.0
@@ -60,42 +59,33 @@ TINY = 1e-300
 
 
 class AgeRecord(msgspec.Struct, frozen=True):
-    """Record of the ages of the information that moved the vehicle, and the link that follows from it."""
+    """Record of the ages of the information that moved the vehicle, and the level that follows from it."""
 
-    # Steps with information 1 … H steps old, and older; those of before, and the prior, are forgotten gradually
+    # Steps with information 1 … H steps old, and older. It begins with PRIOR_STEPS of the configured link and one run
+    # of H losses; all is forgotten gradually
     counts: tuple[float, ...] = ()
     steps: int = 0  # steps so far
-    link: int | None = None  # index of the observed link; None before the first review
+    level: int = CERTIFICATE_LEVEL  # level of the observed link; the certificate before the first review
 
 
-@dataclass(frozen=True, eq=False)
-class AgePrior:
-    """Prior of a record of ages: the configured link, and one run of losses as long as the horizon."""
+def count_age(record: AgeRecord, age: int, shares: Array) -> AgeRecord:
+    """Count a step that information `age` steps old (from 1 on) moved the vehicle in, and review the link.
 
-    allowed: float  # α = 1 - δ_x
-    shares: Array  # π_t (H+1,) of the configured link, the last one of all older ages
-
-    @property
-    def counts(self) -> Array:
-        """Counts (H+1,) that a record begins with."""
-        # Information gets 1, 2 … H+1 steps old in a run of H losses.
-        return PRIOR_STEPS * self.shares + 1.0
-
-
-def count_age(record: AgeRecord, age: int, prior: AgePrior) -> AgeRecord:
-    """Count a step that information `age` steps old (from 1 on) moved the vehicle in, and review the link."""
-    weight, size = 0.5 ** (1.0 / HALF_LIFE_STEPS), len(prior.shares)
-    counts = [weight * count for count in record.counts or prior.counts.tolist()]
-    counts[min(max(age, 1), size) - 1] += 1.0
+    Args:
+        shares: π_t (H+1,) of the configured link, the last one of all older ages.
+    """
+    # Information gets 1, 2 … H+1 steps old in a run of H losses.
+    weight, begin = 0.5 ** (1.0 / HALF_LIFE_STEPS), record.counts or (PRIOR_STEPS * shares + 1.0).tolist()
+    counts = [weight * count for count in begin]
+    counts[min(max(age, 1), len(counts)) - 1] += 1.0
     steps = record.steps + 1
-    if steps % REVIEW_STEPS:
-        return AgeRecord(tuple(counts), steps, record.link)
-    return AgeRecord(tuple(counts), steps, find_nearest_link(*bound_link(counts)))
+    level = record.level if steps % REVIEW_STEPS else find_nearest_level(*bound_link(counts))
+    return AgeRecord(tuple(counts), steps, level)
 
 
-def find_prior_link(prior: AgePrior) -> int:
-    """Return the index of the link nearest to the configured one."""
-    return find_nearest_link(*bound_link((LONG_RECORD_STEPS * prior.shares).tolist()))
+def find_configured_level(shares: Array) -> int:
+    """Return the level of the link nearest to the configured one, with the shares π_t (H+1,) of its ages."""
+    return find_nearest_level(*bound_link((LONG_RECORD_STEPS * shares).tolist()))
 
 
 def bound_link(counts: Sequence[float]) -> tuple[float, float]:

@@ -82,7 +82,7 @@ def make_conditioned_id(
     anywhere = replace(problem, target=np.zeros_like(problem.target), u_target=np.zeros_like(problem.u_target))
     parts = METHOD, anywhere, link, allowed, slew_mps3, cov, filter_plant
     flags = (*(["levels of observed links"] if adapts else []), *([] if bounds_slack else ["slack is not bounded"]))
-    # Recordings of before have the hash without flags.
+    # Without flags the hash is that of recordings without `risk.budgets`.
     return digest((*parts, *flags))
 
 

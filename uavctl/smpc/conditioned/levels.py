@@ -57,6 +57,11 @@ class Allocation:
     # not fall with age, and the last one is that of a plan at rest
     reference_backoffs: Array
 
+    @property
+    def follows_age(self) -> bool:
+        """Whether the reference moves away from limits with the age of the information."""
+        return len(self.reference_backoffs) > 1
+
 
 @dataclass(frozen=True, eq=False)
 class RiskLevel:
@@ -64,7 +69,6 @@ class RiskLevel:
 
     near: Allocation  # beside limits
     motion: Allocation  # along motions, whose plans meet limits at any age
-    transit: Allocation  # where the target is far from all limits
     far: Array  # distance (m,) of a target from each row beyond which it is far from it
     transit_bounds: Array  # bounds on a target far from limits, without limits of a preview and widening
 
@@ -95,7 +99,7 @@ class RiskLevels:
         cov: Array | None,
         filter_plant: Plant,
         *,
-        has_lower_levels: bool,
+        has_observed_levels: bool,
         bounds_slack: bool,
     ) -> None:
         self._problem, self._law, self._parts, self._equilibria = problem, law, parts, equilibria
@@ -107,11 +111,11 @@ class RiskLevels:
             allocate_by_age(link, self._select_position_deviations(), allowed, exponent, n_parts),
             bounds_slack=bounds_slack,
         )
-        # Where a target is far from all limits, limits matter in transit only, and all levels share one allocation.
+        # Where the target is far from all limits, they matter in transit only, and all levels share one allocation.
         self.transit = self._make_bounded(allocate_equally(link, steps, allowed, n_parts), bounds_slack=bounds_slack)
         self._levels = {CONFIGURED_LEVEL: self._make_level(near, self.transit.risk)}
         self._free: Allocation | None = None  # without back-offs; None without levels of observed links
-        if has_lower_levels:
+        if has_observed_levels:
             self._is_possible = np.arange(steps) < self._count_possible_ages(cov, allowed)
             risk, budgets = near.risk, np.where(self._is_possible, allowed, 1.0)
             certificate = AgeRisk(risk.age_probabilities, 0.0, budgets)
@@ -168,7 +172,7 @@ class RiskLevels:
         share = np.array(self._allowed / len(self._parts))
         distance = np.maximum(self.transit.reference_backoffs[-1, -1], near.reference_backoffs[-1, -1])
         far = np.maximum(distance, float(compute_quantile(share)) * oldest)
-        return RiskLevel(near, motion or near, self.transit, far, transit_bounds=(self._b - far)[self._reference_rows])
+        return RiskLevel(near, motion or near, far, transit_bounds=(self._b - far)[self._reference_rows])
 
     def get(self, level: int) -> RiskLevel:
         """Return a level; that of an observed link is made when it is asked for first."""

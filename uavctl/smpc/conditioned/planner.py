@@ -45,7 +45,6 @@ from uavctl.smpc.answer import (
     is_finite,
 )
 from uavctl.smpc.batch import Decisions, gather_answers
-from uavctl.smpc.conditioned.adaptation import AgePrior
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
     MAX_RISK,
@@ -117,7 +116,7 @@ class ConditionedSolver:
         slew_mps3: Largest change of the acceleration setpoint in a second [m/s³], see `SlewRows`; infinite: no limit.
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
-        has_lower_levels: Whether there are the certificate and the levels of observed links.
+        has_observed_levels: Whether there are the certificate and the levels of observed links.
         bounds_slack: Whether new plans beside a limit may seldom need slack, see `compute_reference_backoffs`.
 
     Raises:
@@ -135,7 +134,7 @@ class ConditionedSolver:
         cov: Array | None = None,
         filter_plant: Plant | None = None,
         *,
-        has_lower_levels: bool = False,
+        has_observed_levels: bool = False,
         bounds_slack: bool = True,
     ) -> None:
         self.problem = problem
@@ -189,7 +188,7 @@ class ConditionedSolver:
             exponent,
             cov,
             self.filter_plant,
-            has_lower_levels=has_lower_levels,
+            has_observed_levels=has_observed_levels,
             bounds_slack=bounds_slack,
         )
         self._cached_rest: tuple[tuple[int, float, bytes], _Rest] | None = None
@@ -204,6 +203,11 @@ class ConditionedSolver:
     def transit_risk(self) -> AgeRisk:
         """Risk by age where the target is far from all limits."""
         return self._levels.transit.risk
+
+    @property
+    def age_shares(self) -> Array:
+        """Shares π_t (H+1,) of the ages on the configured link, the last one of all older ages."""
+        return np.append(self.risk.age_probabilities, self.risk.older_probability)
 
     def select_risk(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """Select the risk of a plan to `target` (n_x,), by the target, the limits and whether there is a motion."""
@@ -313,7 +317,7 @@ class ConditionedSolver:
         The reference of an age is on the line from the target to the reference `rest` of a plan at rest, where the rows
         that limit it keep the distances of the age.
         """
-        if len(self._levels.get(preview.level).near.reference_backoffs) == 1 or preview.path is not None:
+        if not self._levels.get(preview.level).near.follows_age or preview.path is not None:
             return ()
         sides = limits if limits.ndim == 1 else limits.min(axis=0)
         count = self._count_limits(target, sides, preview)
@@ -339,9 +343,9 @@ class ConditionedSolver:
 
         Between opposite limits they take no more than half of the room each.
         """
-        backoffs = self._levels.get(preview.level).near.reference_backoffs
-        distances: Array = preview.widening * backoffs[:, min(count, len(self._parts)) - 1]
-        if len(distances) > 1:
+        near = self._levels.get(preview.level).near
+        distances: Array = preview.widening * near.reference_backoffs[:, min(count, len(self._parts)) - 1]
+        if near.follows_age:
             distances[-SILENT_STAGES:] *= preview.silence_widening
         first, second = self._opposite.T
         # d_i <= (b_i + b_j) / 2 for c_i = -c_j
@@ -376,7 +380,7 @@ class ConditionedSolver:
         if limits is not self._b or preview.widening != 1.0:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
             kept = (sides - preview.widening * level.far)[self._reference_rows]
-        return level.transit if np.count_nonzero(target_rows <= kept) == kept.size else level.near
+        return self._levels.transit if np.count_nonzero(target_rows <= kept) == kept.size else level.near
 
     def _find_row_backoffs(self, allocation: Allocation, preview: Preview) -> _RowBackoffs:
         """Return the first back-offs of a plan from a position of age a; the last ones are cached, by their bits.
@@ -389,7 +393,7 @@ class ConditionedSolver:
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             plain, age = self._deviations.compute(preview.cov), preview.age
             sigma = bound_widening(preview.widening * plain, plain, allocation.quantiles[age], self._b, self._opposite)
-            if len(allocation.reference_backoffs) == 1:
+            if not allocation.follows_age:
                 sigma[len(sigma) - 1 - age :] *= preview.silence_widening
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
             backoff = allocation.quantiles[age] * sigma
@@ -565,12 +569,3 @@ class ConditionedDecider:
             for i, (row, preview) in enumerate(zip(x, previews, strict=True))
         ]
         return gather_answers(answers, (problem.horizon, problem.plant.n_u))
-
-
-def make_age_prior(solver: ConditionedSolver, allowed: float) -> AgePrior:
-    """Make the prior of a record of ages: the configured link.
-
-    Args:
-        allowed: 1 - δ_x.
-    """
-    return AgePrior(allowed, np.append(solver.risk.age_probabilities, solver.risk.older_probability))

@@ -58,18 +58,13 @@ def _to_log_odds(probabilities: Array) -> Array:
 _LOG_ODDS = tuple(_to_log_odds(np.array(values)) for values in (FIRST_LOSSES, CONTINUATIONS))
 
 
-def find_nearest_link(first_loss: float, continuation: float) -> int:
-    """Return the index of the link whose log odds are nearest."""
+def find_nearest_level(first_loss: float, continuation: float) -> int:
+    """Return the level of the link whose log odds are nearest."""
     values = np.clip([first_loss, continuation], 1e-6, 1.0 - 1e-6)
     first, after = (
         int(np.abs(log_odds - value).argmin()) for log_odds, value in zip(_LOG_ODDS, _to_log_odds(values), strict=True)
     )
-    return first * len(CONTINUATIONS) + after
-
-
-def get_observed_level(link: int) -> int:
-    """Return the level of the budgets of an observed link."""
-    return CERTIFICATE_LEVEL + 1 + link
+    return CERTIFICATE_LEVEL + 1 + first * len(CONTINUATIONS) + after
 
 
 def get_link(level: int) -> tuple[float, float]:
