@@ -125,7 +125,7 @@ def whatif(
 
 @dataclass(frozen=True)
 class WhatIfRequest:
-    """What is to be another than in the recorded flight."""
+    """Differences from the recorded flight."""
 
     flight: Path
     config: str | None  # preset or file in place of the recorded configuration
