@@ -27,7 +27,7 @@ from uavctl.records import Record
 ROOT = Path(__file__).resolve().parent.parent
 _CONFIGURATION = """# Configuration
 
-This page lists every key. It is generated from `uavctl/config/` (`make docs`); do not edit it.
+This page lists every key. `make docs` generates it from `uavctl/config/`.
 
 A configuration is a TOML file. The shortest one names a preset and overrides some keys:
 
@@ -40,17 +40,22 @@ north_m = [-2.0, 2.0]
 
 * `--config NAME` takes a file or a preset: `paper`, `room`, `room-px4`, `room-ardupilot` or `room-hahn-stursberg`
   (in `uavctl/presets/`).
-* `--set key.path=value` overrides any key and may be repeated: `--set link.loss=0.3`,
+* `--set key.path=value` overrides a key, as often as you like: `--set link.loss=0.3`,
   `--set 'link.blackout=[[20, 40]]'`. A string needs no quotes.
-* `base` gives the keys that the file lacks. Then `[room]` may replace the lists of `[sets]` and `[target]`.
-  `uavctl init` writes such a file.
-* Without `base` a file needs `[plant]`, `[sets]` and `[cost]`. Other keys have defaults or follow from these.
-* All problems are reported at once, with file, line, key and remedy (exit code 2). Numbers without a range here are
-  -1e7 to 1e7.
-* States are ordered axis by axis: position, velocity, and acceleration with model `drag-lag`. Model
-  `velocity-reference` adds acceleration, lead of the vehicle's reference in position and velocity, and integral.
-* n_x, n_u and n_w are the numbers of states, inputs (one for each axis) and disturbances. H is the horizon, Δt the
-  step.
+* With `base`, missing keys come from there. `[room]` then replaces the lists of `[sets]`, `[target]` and
+  `[limits]`. `uavctl init` writes such a file.
+* Without `base`, a file needs `[plant]`, `[sets]` and `[cost]`.
+* All problems are reported at once, with file, line, key and remedy (exit code 2).
+
+How to read the lists:
+
+* The value after a key is its default. Without one there is none, or brackets say how it follows.
+* (0.2…10) is the range; `>` and `<` exclude its end. Numbers without a range are -1e7 to 1e7.
+* The end of a key is its unit: `_s`, `_m`, `_deg`, `_ppm`, `_hz` (1/s), `_mps` (m/s), `_mps2` (m/s²), `_1ps` (1/s).
+* A span is `[from_s, to_s]` since the start. Vectors are local NED: north, east, down.
+* H is the horizon, Δt the step. n_x, n_u and n_w count states, inputs (one for each axis) and disturbances.
+* States go axis by axis: position, velocity, and acceleration with model `drag-lag`. Model `velocity-reference` adds
+  acceleration, lead of the vehicle's reference in position and velocity, and integral.
 * A plant of `matrices` without `axes` cannot fly. `solve`, `design`, `campaign` and `uavctl.simulate` take it.
 """
 # Keys that follow from others where they are left out.
@@ -99,14 +104,15 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
     """A section's keys and those of its tables, as Markdown; `path` is what its keys begin with."""
     fields = msgspec.structs.fields(section)
     title = f"`[{path}]`" if path else "Top level"
-    yield f"## {title}\n\n{(section.__doc__ or '').strip()}\n"
-    yield "| key | type; default | meaning |\n|---|---|---|"
+    yield "\n".join(
+        (f"## {title}", "", *wrap(" ".join((section.__doc__ or "").split()), 120, break_on_hyphens=False), "")
+    )
     for field in fields:
         if not is_section(field.type):
-            needed = f"{path}.{field.encode_name}" in HAHN_STURSBERG_KEYS
-            default = "required with scheme `hahn-stursberg`" if needed else _default(field, section, path)
-            cells = (f"`{field.encode_name}`", f"{_describe_type(field)}; {default}", get_description(field))
-            yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+            key = f"{path}.{field.encode_name}" if path else field.encode_name
+            needed = key in HAHN_STURSBERG_KEYS
+            default = "required with `hahn-stursberg`" if needed else _describe_default(field, section, key)
+            yield "\n".join(wrap(_describe_key(field, default), 120, subsequent_indent="  ", break_on_hyphens=False))
     yield ""
     for field in fields:
         name = f"{path}.{field.encode_name}" if path else field.encode_name
@@ -117,21 +123,90 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
             yield from tables(field.type, name)
 
 
-def _describe_type(field: FieldInfo) -> str:
-    """Describe a type in few words: without the largest lengths and the ranges that the head of the page states."""
-    text = re.sub(r" \((entries|characters): at most \d+\)| \(>= -1e7, <= 1e7\)", "", describe_type(field.type))
-    text = re.sub(r"\(>= (\S+), <= (\S+)\)", r"(\1 to \2)", text)
-    text = text.replace('" or "', '", "').replace("whole number", "integer").replace("true or false", "boolean")
-    return text.replace("list of lists", "lists").replace("list of ", "")
+# Endings of keys, and the unit that each of them states.
+_UNITS = {
+    "_s": "s",
+    "_m": "m",
+    "_mps": "m/s",
+    "_mps2": "m/s²",
+    "_mps3": "m/s³",
+    "_1ps": "1/s",
+    "_1ps2": "1/s²",
+    "_hz": "1/s",
+    "_deg": "deg",
+    "_dps": "deg/s",
+    "_ppm": "ppm",
+    "_v": "V",
+    "_bytes": "bytes",
+    "_per_s": "1/s",
+    "seconds": "s",
+}
 
 
-def _default(field: FieldInfo, section: type[Section], path: str) -> str:
+_SPANS = "lists of 2 numbers"  # the head of the page says what a span is
+
+
+def _describe_key(field: FieldInfo, default: str) -> str:
+    """Describe a key as an item of a list: name, default, type or range, meaning."""
+    has_value = field.default is not NODEFAULT and field.default is not None
+    is_shown = has_value and field.default != ()  # the default shows the type
+    kind = _describe_type(field, is_shown=is_shown)
+    if '"' in kind:
+        kind = _describe_choices(kind, default if is_shown else "", get_description(field))
+    details = [text for text in (kind, "" if has_value else default) if text and text != _SPANS]
+    head = f"`{field.encode_name} = {default}`" if has_value else f"`{field.encode_name}`"
+    shown = f" ({'; '.join(details)})" if details else ""
+    return f"* {head}{shown}: {_describe_meaning(field, kind)}"
+
+
+def _describe_meaning(field: FieldInfo, kind: str) -> str:
+    """Return the meaning of a key, without a unit that its name or kind states."""
+    meaning, _, unit = get_description(field).removesuffix("]").rpartition(" [")
+    is_stated = kind == _SPANS or any(field.encode_name.endswith(end) and unit == _UNITS[end] for end in _UNITS)
+    return meaning if meaning and is_stated else get_description(field)
+
+
+def _describe_choices(kind: str, default: str, meaning: str) -> str:
+    """Return the choices of a key besides its default; nothing where its meaning has all of them."""
+    choices = re.findall(r'"[^"]+"', kind)
+    others = ", ".join(choice for choice in choices if choice not in default)
+    if not others or all(choice.replace('"', "`") in meaning for choice in choices):
+        return ""
+    return f"or {others}" if default else others
+
+
+def _describe_type(field: FieldInfo, *, is_shown: bool) -> str:
+    """Describe a type in few words: without lengths, and without a kind and a range that page or default show."""
+    text = re.sub(
+        r" \((entries|characters): (at least 1, )?at most \d+\)| \(>= -1e7, <= 1e7\)", "", describe_type(field.type)
+    )
+    text = re.sub(r"\((>=?) (\S+), (<=?) (\S+)\)", lambda found: _describe_range(*found.groups()), text)
+    text = re.sub(r"\(<= (\S+)\)", r"to \1", text).replace("e-0", "e-").replace('" or "', '", "')
+    text = text.replace("whole number", "integer").replace("list of lists", "lists")
+    text = re.sub("^list of string$", "strings", text).replace("list of ", "")
+    if is_shown:
+        text = re.sub(r"^(true or false|string|(integer|\d? ?numbers?) ?)", "", text).removeprefix(", ")
+    return text
+
+
+def _describe_range(lower: str, least: str, upper: str, most: str) -> str:
+    return f"{lower.strip('=') if lower == '>' else ''}{least}…{upper if upper == '<' else ''}{most}"
+
+
+def _describe_default(field: FieldInfo, section: type[Section], key: str) -> str:
     if field.default is NODEFAULT:
-        key = f"{path}.{field.encode_name}" if path else field.encode_name
-        return "required" if section is not Config and not path else _DERIVED.get(key, "required")
-    if field.default is None:
-        return "none"
-    return f"`{msgspec.json.encode(field.default).decode()}`"
+        is_of_campaign = section is not Config and "." not in key
+        return "required" if is_of_campaign else _DERIVED.get(key, "required")
+    return "" if field.default is None else _format_value(msgspec.to_builtins(field.default))
+
+
+def _format_value(value: object) -> str:
+    """Return a value as TOML writes it."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_format_value(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_format_value, value)) + "]"
+    return msgspec.json.encode(value).decode()
 
 
 def campaign_page() -> str:

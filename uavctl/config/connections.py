@@ -15,12 +15,12 @@ from uavctl.config.document import MAX_PATH_LENGTH, MAX_URL_LENGTH, ConfigProble
 
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
-    """Requests to the vehicle; nothing here arms: that takes `--arm --takeoff`."""
+    """Requests to the vehicle (docs/hand-over.md); only `--arm --takeoff` arms."""
 
     answer_s: Annotated[float, declare("time until a request without an effect is repeated", "s", 0.2, 10)] = 1.0
-    retry_s: Annotated[float, declare("time until a request that was refused for now is repeated", "s", 0.2, 10)] = 2.0
-    tries: Annotated[int, declare("times that one request is made at most", "", 1, 100)] = 30
-    ground_s: Annotated[float, declare("longest wait for positions, for the mode, for arming", "s", 0.1, 600)] = 60.0
+    retry_s: Annotated[float, declare("time until a request refused for now is repeated", "s", 0.2, 10)] = 2.0
+    tries: Annotated[int, declare("most tries of one request", "", 1, 100)] = 30
+    ground_s: Annotated[float, declare("longest wait for positions, mode, arming", "s", 0.1, 600)] = 60.0
     fresh_s: Annotated[float, declare("greatest age of the newest position at arming", "s", 0.001, 5)] = 1.0
     climb_s: Annotated[float, declare("longest climb by the vehicle; then it must land", "s", 0.1, 120)] = 20.0
     reached: Annotated[float, declare("share of the take-off height that ends the climb", "", 0.01, 1)] = 0.9
@@ -32,7 +32,7 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     origin_deg_m: Annotated[
         Position,
         declare(
-            "latitude, longitude [deg] and altitude [m] of the origin for an ArduPilot without GPS; any place will do"
+            "latitude, longitude [deg], altitude [m] of the origin for an ArduPilot without GPS; any place will do"
         ),
     ] = (47.397742, 8.545594, 488.0)
 
@@ -116,7 +116,7 @@ class SourceConfig(Section, frozen=True, kw_only=True):
 
 
 class ClockConfig(Section, frozen=True, kw_only=True):
-    """The source's clock."""
+    """Clock of the source (docs/check.md)."""
 
     latency_s: Annotated[float, declare("least delay of a position, for a peer without TIMESYNC", "s", 0, 60)] = 0.0
     window_s: Annotated[float, declare("window of the sliding minimum of (received − stamp)", "s", 0.001, 600)] = 10.0
@@ -124,24 +124,18 @@ class ClockConfig(Section, frozen=True, kw_only=True):
 
 
 class DaemonConfig(Section, frozen=True, kw_only=True):
-    """The control loop and its connections."""
+    """Control loop and connections."""
 
     tick_s: Annotated[float, declare("time between setpoints; divides Δt", "s", 0.001, 0.1)]
     vehicle: Annotated[str, declare("URL of the vehicle", length=MAX_URL_LENGTH)] = "udpin://0.0.0.0:14540"
     mocap: Annotated[
-        str,
-        declare(
-            "URL of the source of positions, which may be the vehicle's; `natnet://SERVER/BODY` and "
-            "`qualisys://SERVER/BODY` (docs/sources.md), or `NAME://SERVER:PORT/BODY` of another package "
-            "(docs/extending.md)",
-            length=MAX_URL_LENGTH,
-        ),
+        str, declare("URL of the positions (docs/sources.md); may be the vehicle's", length=MAX_URL_LENGTH)
     ] = "udpin://0.0.0.0:14560"
     vehicle_system_id: Annotated[int, declare("system id of the vehicle; 0: the first one heard", "", 0, 255)] = 0
     vehicle_component_id: Annotated[int, declare("component id of the autopilot; 0: any, preferably 1", "", 0, 255)] = 0
     system_id: Annotated[int, declare("MAVLink system id of the daemon", "", 1, 255)] = 245
     component_id: Annotated[int, declare("MAVLink component id of the daemon (25 = user 1)", "", 1, 255)] = 25
-    radio_channels: Annotated[bool, declare("ask for RC_CHANNELS, which show whether a pilot moves a stick")] = True
+    radio_channels: Annotated[bool, declare("ask for RC_CHANNELS, which show the pilot's sticks")] = True
     parameters: Annotated[bool, declare("ask for all parameters before arming, for the recording")] = True
 
 
@@ -149,42 +143,36 @@ MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
 
 
 class SecurityConfig(Section, frozen=True, kw_only=True):
-    """Signing of MAVLink 2, allow-list and budgets of the UDP connections."""
+    """Signing, permitted senders and budgets (docs/security.md)."""
 
     key_file: Annotated[
-        str,
-        declare(
-            "file of the signing key, absolute or from `~`, readable by its owner only (`uavctl key new`); "
-            "empty: nothing is signed",
-            length=MAX_PATH_LENGTH,
-        ),
+        str, declare("file of the signing key, absolute or from `~`; empty: nothing is signed", length=MAX_PATH_LENGTH)
     ] = ""
     require: Annotated[
         tuple[Literal["vehicle", "mocap"], ...],
         declare(
-            "connections on which, with a key, all frames are signed; one connection for both is `vehicle`",
-            length=(1, 2),
+            "connections that must be signed, if there is a key; one connection for both is `vehicle`", length=(1, 2)
         ),
     ] = ("vehicle", "mocap")
     link_id: Annotated[int, declare("link id of the vehicle's connection; the cameras' is one more", "", 0, 254)] = 0
     peer_link_ids: Annotated[
         tuple[Annotated[int, Meta(ge=0, le=255)], ...],
-        declare("link ids that peers may sign with; none: the first that each one uses", length=256),
+        declare("link ids that peers may sign with; empty: the first of each", length=256),
     ] = ()
     allow: Annotated[
-        tuple[str, ...], declare("networks that UDP is taken from, as `10.0.0.0/24`; none: any", length=1000)
+        tuple[str, ...], declare("permitted senders of UDP, as `10.0.0.0/24`; empty: any", length=1000)
     ] = ()
     max_datagrams_per_s: Annotated[
         int,
         declare(
-            "UDP datagrams a second of one sender, and of all strangers together; four times as many of the vehicle",
+            "UDP datagrams a second of one sender, and of all strangers together; the vehicle has four times as many",
             "1/s",
             100,
             1_000_000,
         ),
     ] = 2000
-    max_frames_per_s: Annotated[int, declare("the same for frames, before any checksum", "1/s", 100, 1_000_000)] = 800
-    max_bytes_per_s: Annotated[int, declare("the same for their bytes", "1/s", 10_000, 1_000_000_000)] = 200_000
+    max_frames_per_s: Annotated[int, declare("frames a second, likewise", "1/s", 100, 1_000_000)] = 800
+    max_bytes_per_s: Annotated[int, declare("bytes a second, likewise", "1/s", 10_000, 1_000_000_000)] = 200_000
 
 
 def check_security(security: SecurityConfig) -> Iterator[ConfigProblem]:
@@ -260,16 +248,12 @@ MAX_REHEARSALS = 1000  # minutes, and some 400 MB for draws and states of two mi
 
 
 class CheckConfig(Section, frozen=True, kw_only=True):
-    """`uavctl check`, and the check before `uavctl fly --arm` arms (docs/check.md)."""
+    """`uavctl check`, and the check before arming (docs/check.md)."""
 
-    seconds: Annotated[float, declare("time of listening to positions and vehicle", "s", 0.001, 600)] = 8.0
-    wait_s: Annotated[float, declare("longer wait for a vehicle that has no position yet", "s", 0, 600)] = 15.0
+    seconds: Annotated[float, declare("listening time", "s", 0.001, 600)] = 8.0
+    wait_s: Annotated[float, declare("further wait for a vehicle without a position", "s", 0, 600)] = 15.0
     same_origin: Annotated[
-        bool,
-        declare(
-            "the vehicle's own position has the cameras' origin after [frame]; `false`: that of where it was "
-            "switched on"
-        ),
+        bool, declare("the vehicle's own position has the cameras' origin after [frame]; else that of its start")
     ] = True
     offset_m: Annotated[
         float, declare("largest distance between the vehicle's own position and the cameras'", "m", 0.001, 1e6)
@@ -279,21 +263,19 @@ class CheckConfig(Section, frozen=True, kw_only=True):
         float, declare("largest angle between the cameras' north and the vehicle's", "deg", 0.01, 45)
     ] = 10.0
     margin_m: Annotated[float, declare("how far outside `sets` a flight may begin", "m", 0, 1000)] = 0.25
-    rehearsals: Annotated[int, declare("rehearsals, for the risk to leave the room", "", 0, MAX_REHEARSALS)] = 60
+    rehearsals: Annotated[int, declare("rehearsed flights, for the risk to leave the room", "", 0, MAX_REHEARSALS)] = 60
     battery_v: Annotated[float, declare("least voltage of the battery; 0: not tested", "V", 0, 1000)] = 0.0
-    accept: Annotated[tuple[str, ...], declare("items that may fail without a refusal to arm", length=100)] = ()
+    accept: Annotated[tuple[str, ...], declare("items that may fail", length=100)] = ()
 
 
 class RelayConfig(Section, frozen=True, kw_only=True):
-    """External positions, passed on to the vehicle's own estimator on the vehicle's link (docs/check.md)."""
+    """External positions, passed on to the vehicle's estimator (docs/check.md)."""
 
     enabled: Annotated[bool, declare("pass positions on")] = False
-    message: Annotated[
-        Literal["vision-position-estimate", "odometry"],
-        declare("MAVLink message, in local NED; PX4 and ArduPilot take both"),
-    ] = "vision-position-estimate"
+    message: Annotated[Literal["vision-position-estimate", "odometry"], declare("MAVLink message")] = (
+        "vision-position-estimate"
+    )
     vehicle_time: Annotated[
-        bool,
-        declare("stamp positions by the vehicle's clock, for a vehicle that asks for our time (PX4); else by ours"),
+        bool, declare("stamp positions by the vehicle's clock if it asks for our time (PX4); else by ours")
     ] = True
     rate_hz: Annotated[float, declare("largest rate; the newest are sent", "1/s", 0.1, 1000)] = 50.0

@@ -34,13 +34,12 @@ MAX_DELAY_S = 60.0
 
 
 class LinkConfig(Section, frozen=True, kw_only=True):
-    """The radio link that carries positions: the design's assumption, and the simulator's channel."""
+    """The link that carries positions: the design assumes it, the simulator has it."""
 
     loss: Annotated[
         float,
         declare(
-            "probability that a packet is lost; the design counts on 1 − lossⁿ for the n positions of a Δt "
-            "(source.rate_hz)",
+            "probability that a packet is lost; the design counts on 1 − lossⁿ for n positions in Δt (source.rate_hz)",
             low=0,
             below=1,
         ),
@@ -48,59 +47,55 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     model: Annotated[
         Literal["bernoulli", "gilbert-elliott", "empirical", "trace"],
         declare(
-            "how packets are lost. `bernoulli`: each by itself; `gilbert-elliott`: in bursts, by a channel "
-            "that is good (`loss`) or bad (`burst_loss`); `empirical`: in runs as measured (`gaps`); `trace`: "
-            "lost and late as measured (`trace_file`)"
+            "how packets are lost: `bernoulli` (each by itself), `gilbert-elliott` (in bursts, by a good and a bad "
+            "state), `empirical` (in measured runs) or `trace` (lost and late as measured)"
         ),
     ] = "bernoulli"
     probability: Annotated[
         tuple[Probability, ...],
         declare(
-            "with `bernoulli`, in place of `loss`: probability that a packet of step k arrives, k = 0, 1, …, "
-            "the last one repeated; the design counts on the least of the steps ahead",
+            "`bernoulli`, in place of `loss`: probability that a packet of step k arrives, the last one repeated; the "
+            "design counts on the least of the steps ahead",
             length=10_000,
         ),
     ] = ()
     gaps: Annotated[
         tuple[Probability, ...],
         declare(
-            "with `empirical`: probability of i lost packets in a row, i = 0, 1, …; they add up to 1",
-            length=MAX_LOSS_RUN + 1,
+            "`empirical`: probability of i lost packets in a row, i = 0, 1, …; the sum is 1", length=MAX_LOSS_RUN + 1
         ),
     ] = ()
     trace_file: Annotated[
         str,
         declare(
-            "with `trace`: CSV file beside this one with a line for each packet: its delay in s, nothing or "
-            "`inf` if lost; of several columns the one headed `delay_s` (or `_ms`, `_us`, `_ns`)",
+            "`trace`: CSV file beside this one with the delay [s] of each packet, nothing or `inf` if lost; of "
+            "several columns `delay_s` (or `_ms`, `_us`, `_ns`)",
             length=MAX_PATH_LENGTH,
         ),
     ] = ""
     trace_s: Annotated[
         UnboundedFloats,
         declare(
-            "with `trace`: these delays as a list, repeated after its end; longer ones than delay_s + jitter_s "
-            "are lost to the design",
+            "`trace`: these delays as a list, repeated at its end; the design counts those above delay_s + jitter_s "
+            "as lost",
             "s",
             length=MAX_TRACE_PACKETS,
         ),
     ] = ()
     burst_enter: Annotated[float, declare("`gilbert-elliott`: probability of entering the bad state", "", 0, 1)] = 0.0
     burst_leave: Annotated[float, declare("`gilbert-elliott`: probability of leaving it", high=1, above=0)] = 1.0
-    burst_loss: Annotated[float, declare("`gilbert-elliott`: loss in it", "", 0, 1)] = 1.0
-    delay_s: Annotated[float, declare("constant delay of a packet, but with `trace`", "s", 0, MAX_DELAY_S)] = 0.0
+    burst_loss: Annotated[
+        float, declare("`gilbert-elliott`: loss in the bad state; in the good one it is `loss`", "", 0, 1)
+    ] = 1.0
+    delay_s: Annotated[float, declare("constant delay of a packet, not with `trace`", "s", 0, MAX_DELAY_S)] = 0.0
     jitter_s: Annotated[float, declare("uniform extra delay; packets may overtake", "s", 0, MAX_DELAY_S)] = 0.0
     duplicate: Annotated[float, declare("probability that a packet comes twice", "", 0, 1)] = 0.0
     corrupt: Annotated[float, declare("probability that one bit of a packet is flipped", "", 0, 1)] = 0.0
     truncate: Annotated[float, declare("probability that a packet is cut short", "", 0, 1)] = 0.0
-    oversize: Annotated[float, declare("probability of a datagram of over 4096 bytes", "", 0, 1)] = 0.0
-    blackout: Annotated[
-        Spans, declare("spans [from_s, to_s] in which all packets are lost", "s", length=MAX_SPANS)
-    ] = ()
-    held: Annotated[Spans, declare("spans [from_s, to_s] that hold packets to their end", "s", length=MAX_SPANS)] = ()
-    uplink_blackout: Annotated[
-        Spans, declare("spans [from_s, to_s] in which nothing reaches the vehicle", "s", length=MAX_SPANS)
-    ] = ()
+    oversize: Annotated[float, declare("probability of a datagram above 4096 bytes", "", 0, 1)] = 0.0
+    blackout: Annotated[Spans, declare("spans in which all packets are lost", "s", length=MAX_SPANS)] = ()
+    held: Annotated[Spans, declare("spans that hold packets to their end", "s", length=MAX_SPANS)] = ()
+    uplink_blackout: Annotated[Spans, declare("spans in which nothing reaches the vehicle", "s", length=MAX_SPANS)] = ()
 
 
 _COLUMN = "delay_s"

@@ -46,8 +46,8 @@ class TrajectoryConfig(Section, frozen=True, kw_only=True):
     file: Annotated[
         str,
         declare(
-            "CSV file with the samples, beside this one: t, x, y, z and perhaps vx, vy, vz in s, m and m/s, "
-            "local NED; a header may state others, as in `time_ms`, `east_m`, `height [cm]`",
+            "CSV file with the samples, beside this one: t, x, y, z and perhaps vx, vy, vz; or with a header, as in "
+            "`time_ms`, `east_m`, `height [cm]`",
             length=MAX_PATH_LENGTH,
         ),
     ] = ""
@@ -55,23 +55,23 @@ class TrajectoryConfig(Section, frozen=True, kw_only=True):
 
 
 class MissionConfig(Section, frozen=True, kw_only=True):
-    """Waypoints, or a trajectory; with neither, `target.position_m` is held from start to end."""
+    """Waypoints, or a trajectory; with neither, `target.position_m` is held."""
 
     waypoints: Annotated[tuple[Position, ...], declare("positions to fly to, local NED", "m", length=1000)] = ()
     hold_s: Annotated[
-        Number | Annotated[Floats, Meta(max_length=1000)], declare("time at each waypoint: one number, or a list", "s")
+        Number | Annotated[Floats, Meta(max_length=1000)], declare("time at each waypoint: one, or a list", "s")
     ] = 0.0
     accept_m: Annotated[float, declare("distance at which a waypoint is reached", "m", 0.001, 1e6)] = 0.3
     then: Annotated[
         Literal["hold", "land"],
-        declare("at the end: `hold` the place, or `land`: brake and hand over to the vehicle's own landing"),
+        declare("at the end: `hold` the place, or `land` (brake, then the vehicle's own landing)"),
     ] = "hold"
     yaw: Annotated[
         Literal["hold", "path", "angle"],
-        declare("`hold`: no yaw setpoint; `path`: along the planned motion from 0.3 m/s on; `angle`: `yaw_deg`"),
+        declare("`hold` (no yaw setpoint), `path` (along the planned motion, from 0.3 m/s on) or `angle` (yaw_deg)"),
     ] = "hold"
     yaw_deg: Annotated[Annotated[float, Meta(ge=-180, le=180)] | None, declare("clockwise from north", "deg")] = None
-    yaw_rate_dps: Annotated[float, declare("fastest turn of yaw; ArduPilot's own limit is 60", "deg/s", 1, 360)] = 60.0
+    yaw_rate_dps: Annotated[float, declare("fastest turn; ArduPilot's own limit is 60", "deg/s", 1, 360)] = 60.0
     trajectory: TrajectoryConfig = TrajectoryConfig()
 
 
@@ -82,8 +82,8 @@ class FenceConfig(Section, frozen=True, kw_only=True):
         Annotated[str, Meta(max_length=100)] | Annotated[int, Meta(ge=0, lt=MAX_STATES)],
         declare("axis whose position is limited, or index of a state"),
     ]
-    side: Annotated[Literal["lower", "upper"], declare("which limit")]
-    times_s: Annotated[Floats, declare("times, increasing; counted as those of the mission", "s", length=(1, 1000))]
+    side: Annotated[Literal["lower", "upper"], declare("limit")]
+    times_s: Annotated[Floats, declare("times, increasing, from the first decision", "s", length=(1, 1000))]
     values: Annotated[Floats, declare("limits at these times, linear in between", "m, m/s, m/s²", length=(1, 1000))]
 
 

@@ -21,17 +21,17 @@ ROOM_KEYS = ("sets", "target.position_m", "limits.accel_mps2")
 
 
 class RoomConfig(Section, frozen=True, kw_only=True):
-    """Limits of the vehicle's centre and its target by name, in place of `[sets]`, `[target]` and their lists."""
+    """Limits of the vehicle's centre, and its target, by name."""
 
     north_m: Annotated[Span, declare("least and largest position north", "m")] = None
     east_m: Annotated[Span, declare("least and largest position east", "m")] = None
-    height_m: Annotated[Span, declare("least and largest height above the origin, up is positive", "m")] = None
+    height_m: Annotated[Span, declare("least and largest height above the origin, up positive", "m")] = None
     speed_mps: Annotated[Size, declare("largest speed north, and east", "m/s")] = None
     climb_mps: Annotated[Size, declare("largest speed up and down", "m/s")] = None
     accel_mps2: Annotated[Size, declare("largest acceleration setpoint north, and east", "m/s²")] = None
-    target_north_m: Annotated[Number | None, declare("target [m]; without it where the base has it")] = None
-    target_east_m: Annotated[Number | None, declare("target [m]; without it where the base has it")] = None
-    target_height_m: Annotated[Number | None, declare("target [m]; without it where the base has it")] = None
+    target_north_m: Annotated[Number | None, declare("target; default: that of the base", "m")] = None
+    target_east_m: Annotated[Number | None, declare("target; default: that of the base", "m")] = None
+    target_height_m: Annotated[Number | None, declare("target; default: that of the base", "m")] = None
 
 
 _AXIS_KEYS = {

@@ -30,73 +30,64 @@ class CameraConfig(Section, frozen=True, kw_only=True):
     rate_hz: Annotated[float, declare("samples a second", "1/s", 0.01, 1000)]
     phase_s: Annotated[float, declare("time of the first sample; then every 1/rate_hz", "s", 0, MAX_DURATION_S)] = 0.0
     noise_std_m: Annotated[float, declare("noise of a position, each axis", "m", 0, 1000)] = 0.0
-    latency_s: Annotated[float, declare("processing time in the cameras, before the link", "s", 0, 60)] = 0.0
+    latency_s: Annotated[float, declare("processing time in the cameras", "s", 0, 60)] = 0.0
     jitter_s: Annotated[float, declare("uniform extra processing time; samples may overtake", "s", 0, 60)] = 0.0
     clock_offset_s: Annotated[float, declare("offset of the cameras' clock", "s", -3999, 1e9)] = 0.0
     clock_drift_ppm: Annotated[float, declare("gain of the cameras' clock; recorded: 1e4 to 3e4", "ppm", -1e5, 1e5)] = (
         0.0
     )
-    occluded: Annotated[Spans, declare("spans [from_s, to_s] without samples", "s", length=MAX_SPANS)] = ()
+    occluded: Annotated[Spans, declare("spans without samples", "s", length=MAX_SPANS)] = ()
     occlusions_per_s: Annotated[float, declare("random occlusions that begin in a second", "1/s", 0, 100)] = 0.0
-    occlusion_s: Annotated[float, declare("their mean length (exponential)", "s", 0.001, MAX_DURATION_S)] = 0.5
+    occlusion_s: Annotated[
+        float, declare("mean length of random occlusions (exponential)", "s", 0.001, MAX_DURATION_S)
+    ] = 0.5
     swapped: Annotated[
-        Spans,
-        declare(
-            "spans [from_s, to_s] in which a body that rests at other_body_m is taken for the vehicle",
-            "s",
-            length=MAX_SPANS,
-        ),
+        Spans, declare("spans in which a body at other_body_m is taken for the vehicle", "s", length=MAX_SPANS)
     ] = ()
-    other_body_m: Annotated[Position, declare("position of that other body, local NED", "m")] = (0.0, 0.0, 0.0)
-    frozen: Annotated[Spans, declare("spans [from_s, to_s] that repeat the last pose", "s", length=MAX_SPANS)] = ()
+    other_body_m: Annotated[Position, declare("position of that body, local NED", "m")] = (0.0, 0.0, 0.0)
+    frozen: Annotated[Spans, declare("spans that repeat the last pose", "s", length=MAX_SPANS)] = ()
     message: Annotated[
         Literal["vision", "vicon", "mocap", "odometry"], declare("MAVLink message; `odometry` has the velocity too")
     ] = "vision"
 
 
 class WindConfig(Section, frozen=True, kw_only=True):
-    """Wind of the simulated quadrotor: steady, with Dryden gusts (docs/vehicle.md)."""
+    """Wind of the simulated quadrotor, with Dryden gusts (docs/vehicle.md)."""
 
-    velocity_mps: Annotated[Wind, declare("steady wind: velocity of the air, local NED", "m/s")] = (0.0, 0.0, 0.0)
+    velocity_mps: Annotated[Wind, declare("steady velocity of the air, local NED", "m/s")] = (0.0, 0.0, 0.0)
     gust_wind_mps: Annotated[float, declare("wind at 20 ft that sets the gusts (light: 7.7)", "m/s", 0, 50)] = 0.0
-    height_m: Annotated[float, declare("height for which the gusts' scales are taken", "m", 0.01, 1000)] = 2.0
+    height_m: Annotated[float, declare("height that sets the gusts' scales", "m", 0.01, 1000)] = 2.0
 
 
 class QuadrotorConfig(Section, frozen=True, kw_only=True):
     """The simulated quadrotor (docs/vehicle.md)."""
 
-    charge: Annotated[float, declare("charge of the battery at the start", high=1, above=0)] = 1.0
+    charge: Annotated[float, declare("battery at the start", high=1, above=0)] = 1.0
 
 
 class InertialConfig(Section, frozen=True, kw_only=True):
-    """Inertial measurements of the simulated autopilot, and the attitude told with them (docs/vehicle.md)."""
+    """Inertial data and attitude of the simulated autopilot (docs/vehicle.md)."""
 
-    errors: Annotated[float, declare("size of its errors, relative to docs/vehicle.md", "", 0, 10)] = 1.0
-    flown: Annotated[bool, declare("whether the quadrotor itself flies by the wrong attitude")] = False
+    errors: Annotated[float, declare("factor of the errors in docs/vehicle.md", "", 0, 10)] = 1.0
+    flown: Annotated[bool, declare("the quadrotor flies by the wrong attitude")] = False
 
 
 class ChecksConfig(Section, frozen=True, kw_only=True):
-    """False alarms of the simulated autopilot: checks that fail though nothing is wrong (docs/autopilots.md)."""
+    """False alarms of the simulated autopilot (docs/autopilots.md)."""
 
     flicker_s: Annotated[
-        float,
-        declare("mean time until pre-flight checks change between pass and fail; 0: they stay", "s", 0, MAX_DURATION_S),
+        float, declare("mean time between changes of pre-flight checks; 0: they stay", "s", 0, MAX_DURATION_S)
     ] = 0.0
     invalid: Annotated[
-        Spans,
-        declare(
-            "spans [from_s, to_s] since arming in which its position is invalid: its failsafe acts",
-            "s",
-            length=MAX_SPANS,
-        ),
+        Spans, declare("spans since arming with an invalid position: the failsafe acts", "s", length=MAX_SPANS)
     ] = ()
-    clears: Annotated[bool, declare("whether a failsafe without a position ends with its cause, as in PX4")] = False
+    clears: Annotated[bool, declare("such a failsafe ends with its cause, as in PX4")] = False
 
 
 class FaultConfig(Section, frozen=True, kw_only=True):
-    """A fault of the simulated flight at a given time; `uavctl sim --faults FILE` reads a list of them."""
+    """A fault of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
 
-    at_s: Annotated[float, declare("when, since the start", "s", 0, MAX_DURATION_S)]
+    at_s: Annotated[float, declare("time since the start", "s", 0, MAX_DURATION_S)]
     kind: Annotated[
         Literal[
             "blackout",
@@ -114,31 +105,32 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             "mode",
         ],
         declare(
-            "a span of `[link]` (`blackout`, `held`, `uplink_blackout`) or `[sim.camera]` (`occluded`, "
-            "`swapped`, `frozen`); or from then on another steady `wind`, `battery` charge, camera `frame`, "
-            "position `noise`, `drift` of the cameras' origin, `parameter` of the autopilot, or `mode` by the "
-            "pilot's stick"
+            "a span of `[link]` (`blackout`, `held`, `uplink_blackout`) or `[sim.camera]` (`occluded`, `swapped`, "
+            "`frozen`); or lasting: steady `wind`, `battery` charge, camera `frame`, position `noise`, `drift` of the "
+            "cameras' origin, `parameter` of the autopilot, `mode` by the pilot's stick"
         ),
     ]
     for_s: Annotated[float, declare("length of a span", "s", 0, MAX_DURATION_S)] = 0.0
-    velocity_mps: Annotated[
-        Wind, declare("of the air (`wind`) or of the cameras' origin (`drift`), local NED", "m/s")
-    ] = (0.0, 0.0, 0.0)
-    charge: Annotated[float, declare("of the battery, with `battery`", "", 0, 1)] = 0.0
+    velocity_mps: Annotated[Wind, declare("of the air (`wind`) or the origin (`drift`), local NED", "m/s")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    charge: Annotated[float, declare("of the battery", "", 0, 1)] = 0.0
     name: Annotated[
         str,
         declare(
-            "of the parameter; of the mode, as the autopilot calls it; of the axes: `turned-90`, `turned-180`, "
-            "`turned-270`, `mirrored-north`, `mirrored-east`, `mirrored-down`, `swapped`, `enu`, "
-            "`millimetres`, `kilometres`, `right`",
+            "parameter; mode, as the autopilot calls it; or frame: `turned-90`, `turned-180`, `turned-270`, "
+            "`mirrored-north`, `mirrored-east`, `mirrored-down`, `swapped`, `enu`, `millimetres`, `kilometres`, "
+            "`right`",
             length=100,
         ),
     ] = ""
-    value: Annotated[float, declare("of the parameter, or the noise's standard deviation", "m", -1e9, 1e9)] = 0.0
+    value: Annotated[float, declare("of the parameter, or standard deviation of the noise", "m", -1e9, 1e9)] = 0.0
 
 
 class SimConfig(Section, frozen=True, kw_only=True):
-    """The simulated side of the wire."""
+    """The simulated vehicle."""
 
     camera: CameraConfig
     wind: WindConfig = WindConfig()
@@ -147,14 +139,15 @@ class SimConfig(Section, frozen=True, kw_only=True):
     checks: ChecksConfig = ChecksConfig()
     plant: Annotated[
         Literal["linear", "quadrotor"],
-        declare("the plant of `[plant]` without its dead time, or a quadrotor with rotors, battery and autopilot"),
+        declare(
+            "`linear` (`[plant]` without its dead time) or `quadrotor` (rotors, battery, autopilot; docs/vehicle.md)"
+        ),
     ] = "linear"
     autopilot: Annotated[Literal["px4", "ardupilot"], declare("the simulated autopilot")] = "px4"
     streams: Annotated[
-        Literal["few", "onboard"],
-        declare("messages that come unasked: `few`, or `onboard`: over 300 a second, as a PX4 sends on such a link"),
+        Literal["few", "onboard"], declare("messages that come unasked: `few`, or `onboard` (over 300 a second)")
     ] = "few"
-    fault: Annotated[tuple[FaultConfig, ...], declare("what happens in the course of a flight", length=MAX_FAULTS)] = ()
+    fault: Annotated[tuple[FaultConfig, ...], declare("faults in the course of the flight", length=MAX_FAULTS)] = ()
     system_id: Annotated[int, declare("MAVLink system id of the simulated vehicle", "", 1, 250)] = 1
     seed: Annotated[int, declare("seed of every random draw", "", 0, MAX_SEED)] = 0
     start_position_m: Annotated[Position, declare("position at the start, local NED", "m")] = (0.0, 0.0, 0.0)
@@ -162,11 +155,7 @@ class SimConfig(Section, frozen=True, kw_only=True):
     clock_drift_ppm: Annotated[float, declare("gain of the vehicle's clock; recorded: -1.4e4", "ppm", -1e5, 1e5)] = 0.0
     setpoint_timeout_s: Annotated[
         Annotated[float, Meta(ge=0.01, le=3600)] | None,
-        declare(
-            "silence after which setpoints have stopped (COM_OF_LOSS_T, GUID_TIMEOUT); default 0.7; as shipped "
-            "PX4 has 1, ArduPilot 3",
-            "s",
-        ),
+        declare("COM_OF_LOSS_T or GUID_TIMEOUT; default 0.7; as shipped PX4 has 1, ArduPilot 3", "s"),
     ] = None
 
 

@@ -38,7 +38,7 @@ from uavctl.config.sim import SimConfig
 class LogConfig(Section, frozen=True, kw_only=True):
     """Recording."""
 
-    chunk_bytes: Annotated[int, declare("largest chunk of a recording, uncompressed", "bytes", 1024, 2**20)] = 131072
+    chunk_bytes: Annotated[int, declare("largest chunk, uncompressed", "bytes", 1024, 2**20)] = 131072
     segment_bytes: Annotated[int, declare("size at which the next file begins", "bytes", 100_000, 10**12)] = 50_000_000
     queue: Annotated[int, declare("records that may wait for the disk; more are dropped", "", 16, 100_000)] = 8192
     free_bytes: Annotated[int, declare("free space without which no flight begins", "bytes", 0, 10**15)] = 50_000_000
@@ -54,70 +54,47 @@ Delay = Annotated[int, Meta(le=60)]
 
 
 class PlantConfig(Section, frozen=True, kw_only=True):
-    """The plant x(k+1) = A x + B u + E w, w ~ N(0, W); states are ordered axis by axis."""
+    """The plant x(k+1) = A x + B u + E w, w ~ N(0, W).
+
+    `a` to `accel_per_input` belong to model `matrices`, `gain` to `drag-lag`, the last five to `velocity-reference`;
+    `drag_1ps`, `lag_s` and `wind_std_mps2` to both of these.
+    """
 
     model: Annotated[
         Literal["matrices", "drag-lag", "velocity-reference"],
         declare(
-            "`matrices`: a, b, e, w as given; `drag-lag`: an acceleration setpoint that acts after a lag; "
-            "`velocity-reference`: it moves a velocity and position that the vehicle's own loops hold"
+            "`matrices` (A, B, E, W as given), `drag-lag` (acceleration setpoints act after a lag) or "
+            "`velocity-reference` (they move a reference that the vehicle's own loops follow)"
         ),
     ]
     dt_s: Annotated[float, declare("time step Δt", "s", 0.001, 5)]
     axes: Annotated[
-        tuple[Literal["north", "east", "down"], ...],
-        declare(
-            "axes of local NED in the order of the states; `matrices` without axes are planned for and "
-            "simulated, and fly nowhere",
-            length=3,
-        ),
+        tuple[Literal["north", "east", "down"], ...], declare("axes of local NED in the order of the states", length=3)
     ] = ()
-    a: Annotated[Rows, declare("A (n_x, n_x), with model `matrices`", length=MAX_STATES)] = ()
-    b: Annotated[Rows, declare("B (n_x, n_u), with model `matrices`", length=MAX_STATES)] = ()
-    e: Annotated[Rows, declare("E (n_x, n_w), with model `matrices`", length=MAX_STATES)] = ()
-    w: Annotated[
-        Rows,
-        declare(
-            "covariance W (n_w, n_w) of the disturbance, with model `matrices`; default: identity", length=MAX_STATES
-        ),
-    ] = ()
-    position_index: Annotated[tuple[int, ...], declare("state of each axis' position, with `matrices`", length=3)] = ()
-    velocity_index: Annotated[tuple[int, ...], declare("state of each axis' velocity, with `matrices`", length=3)] = ()
-    accel_per_input: Annotated[
-        Floats, declare("acceleration per input, with `matrices`", "m/s² per unit", length=3)
-    ] = ()
-    drag_1ps: Annotated[Floats, declare("drag c of each axis [1/s], not with model `matrices`", length=3)] = ()
-    lag_s: Annotated[Floats, declare("acceleration lag T of each axis [s], not with model `matrices`", length=3)] = ()
-    gain: Annotated[Floats, declare("acceleration reached per acceleration ordered, with `drag-lag`", length=3)] = ()
+    a: Annotated[Rows, declare("A (n_x, n_x)", length=MAX_STATES)] = ()
+    b: Annotated[Rows, declare("B (n_x, n_u)", length=MAX_STATES)] = ()
+    e: Annotated[Rows, declare("E (n_x, n_w)", length=MAX_STATES)] = ()
+    w: Annotated[Rows, declare("covariance W (n_w, n_w) of the disturbance; default: identity", length=MAX_STATES)] = ()
+    position_index: Annotated[tuple[int, ...], declare("state of each axis' position", length=3)] = ()
+    velocity_index: Annotated[tuple[int, ...], declare("state of each axis' velocity", length=3)] = ()
+    accel_per_input: Annotated[Floats, declare("acceleration per input", "m/s² per unit", length=3)] = ()
+    drag_1ps: Annotated[Floats, declare("drag c of each axis [1/s]", length=3)] = ()
+    lag_s: Annotated[Floats, declare("acceleration lag T of each axis [s]", length=3)] = ()
+    gain: Annotated[Floats, declare("acceleration reached per acceleration ordered", length=3)] = ()
     wind_std_mps2: Annotated[
-        Floats,
-        declare(
-            "standard deviation of the acceleration noise, constant over Δt, not with `matrices`", "m/s²", length=3
-        ),
+        Floats, declare("standard deviation of the acceleration noise, constant over Δt", "m/s²", length=3)
     ] = ()
     dead_time_s: Annotated[float, declare("time from sending an input until it acts, all axes", "s", 0, 1)] = 0.0
-    position_1ps: Annotated[
-        Floats, declare("position gain of the vehicle, with `velocity-reference`", "1/s", length=3)
-    ] = ()
-    velocity_1ps: Annotated[
-        Floats, declare("velocity gain of the vehicle, with `velocity-reference`", "1/s", length=3)
-    ] = ()
-    integral_1ps2: Annotated[
-        Floats, declare("integral gain of the vehicle, with `velocity-reference`", "1/s²", length=3)
-    ] = ()
+    position_1ps: Annotated[Floats, declare("position gain of the vehicle", "1/s", length=3)] = ()
+    velocity_1ps: Annotated[Floats, declare("velocity gain of the vehicle", "1/s", length=3)] = ()
+    integral_1ps2: Annotated[Floats, declare("integral gain of the vehicle", "1/s²", length=3)] = ()
     input_std_mps2: Annotated[
-        Floats,
-        declare(
-            "standard deviation of reference changes that nobody sent, constant over Δt, with `velocity-reference`",
-            "m/s²",
-            length=3,
-        ),
+        Floats, declare("standard deviation of reference changes that nobody sent, constant over Δt", "m/s²", length=3)
     ] = ()
     force_drift_mps2_rts: Annotated[
         Floats,
         declare(
-            "standard deviation that a lasting force (wind) gains in a second, with `velocity-reference`, in "
-            "place of estimator.bias_drift",
+            "standard deviation that a lasting force (wind) gains in a second; replaces estimator.bias_drift",
             "m/s² / √s",
             length=3,
         ),
@@ -130,7 +107,7 @@ class PlantConfig(Section, frozen=True, kw_only=True):
 
 
 class SetsConfig(Section, frozen=True, kw_only=True):
-    """Admissible boxes X and U; `inf` leaves a side open, any other number is 1e7 at most."""
+    """Admissible boxes X and U; `inf` leaves a side open."""
 
     state_lower: Annotated[UnboundedFloats, declare("lower limits of states (n_x)", "m, m/s, m/s²", length=MAX_STATES)]
     state_upper: Annotated[UnboundedFloats, declare("upper limits of states (n_x)", "m, m/s, m/s²", length=MAX_STATES)]
@@ -139,7 +116,7 @@ class SetsConfig(Section, frozen=True, kw_only=True):
 
 
 class CostConfig(Section, frozen=True, kw_only=True):
-    """Stage cost (3), diagonal weights."""
+    """Stage cost (3)."""
 
     state: Annotated[Weights, declare("diagonal of Q_x (n_x)", length=MAX_STATES)]
     input: Annotated[Weights, declare("diagonal of Q_u (n_u)", length=3)]
@@ -150,20 +127,20 @@ Likelihood = Annotated[float, Meta(gt=0, lt=1)] | None
 
 
 class SmpcConfig(Section, frozen=True, kw_only=True):
-    """The predictive controller; scheme `age-conditioned` ignores keys of the other one."""
+    """The controller."""
 
     scheme: Annotated[
         Scheme,
         declare(
-            "`age-conditioned`: back-offs by the age of information, no planned feedback; `hahn-stursberg`: "
-            "the paper's, with planned feedback and a terminal law"
+            "`age-conditioned` (back-offs by the age, no planned feedback) or `hahn-stursberg` (the paper's: planned "
+            "feedback, terminal law)"
         ),
     ] = "age-conditioned"
     controller: Annotated[
         str,
         declare(
-            "controller of another package in place of the scheme: entry point of `uavctl.controllers` or "
-            "`module:Class` (docs/extending.md); the scheme's design still says where the vehicle may rest",
+            "controller of another package (docs/extending.md): entry point of `uavctl.controllers` or "
+            "`module:Class`; the vehicle may rest where the scheme allows it",
             length=200,
         ),
     ] = ""
@@ -175,11 +152,11 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
     delta_u: Annotated[Likelihood, declare("likelihood δ_u of the input constraints")] = None
     delta_tau: Annotated[Likelihood, declare("threshold δ_τ of Assumption 4.1")] = None
     k_tau: Annotated[Annotated[Rows, Meta(max_length=3)] | None, declare("terminal gain K_τ (n_u, n_x)")] = None
-    slack_linear: Annotated[float, declare("linear penalty of a state's slack", "cost per unit", 1e-6, 1e12)] = 1e5
-    slack_quadratic: Annotated[float, declare("the same, quadratic", "cost per unit²", 1e-6, 1e12)] = 1e3
+    slack_linear: Annotated[float, declare("linear penalty of a slack", "cost per unit", 1e-6, 1e12)] = 1e5
+    slack_quadratic: Annotated[float, declare("quadratic penalty of a slack", "cost per unit²", 1e-6, 1e12)] = 1e3
     offset_weight: Annotated[
         Annotated[float, Meta(ge=1e-6, le=1e12)] | None,
-        declare("l1 weight T that pulls the artificial reference to the target", "cost per unit"),
+        declare("l1 weight T between artificial reference and target", "cost per unit"),
     ] = None
     terminal_weight: Annotated[
         float, declare("l1 weight of a missed terminal equality", "cost per unit", 1e-6, 1e12)
@@ -196,25 +173,24 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
 
     rule: Annotated[
         Literal["fixed", "search", "greedy"],
-        declare("`fixed`: as given; `search`: least cost over search_states; `greedy`: greedy reading of (7)"),
+        declare("`fixed` (as given), `search` (least cost over search_states) or `greedy` (greedy reading of (7))"),
     ] = "fixed"
     delays: Annotated[
         Delay | Annotated[tuple[Delay, ...], Meta(max_length=60)],
-        declare("d_t with rule `fixed`: one integer, or a list of H", "steps"),
+        declare("d_t with rule `fixed`: one, or a list of H", "steps"),
     ] = 0
     gamma_max: Annotated[float, declare("largest γ that `search` and `greedy` take", above=0, below=1)] = 0.985
-    search_states: Annotated[Rows, declare("states over whose mean cost `search` minimises", length=200)] = ()
+    search_states: Annotated[Rows, declare("`search` minimises the mean cost over these states", length=200)] = ()
     joint: Annotated[
         bool,
         declare(
-            "γ by the exact probability that the feedback of all stages is usable; `false`: by the product of "
-            "the stages' own (6), as printed"
+            "γ by the exact probability that the feedback of all stages is usable; else by the product (6), as printed"
         ),
     ] = False
     late: Annotated[
         int,
         declare(
-            "oldest positions that are planned on with a design for their age; at least link.delay_s + link.jitter_s",
+            "oldest positions that plans use, with a design for each age; at least link.delay_s + link.jitter_s",
             "steps",
             0,
             8,
@@ -227,43 +203,43 @@ class RiskConfig(Section, frozen=True, kw_only=True):
 
     allocation: Annotated[
         Literal["ellipsoid", "halfspace"],
-        declare("`ellipsoid`: χ² of the whole vector, as printed; `halfspace`: Boole with Gaussian quantiles"),
+        declare("`ellipsoid` (χ² of the whole vector, as printed) or `halfspace` (Boole with Gaussian quantiles)"),
     ] = "ellipsoid"
     estimate: Annotated[
         Literal["exact", "innovations"],
         declare(
-            "`exact`: a position shows the whole state, as printed; `innovations`: the covariance of the "
-            "estimate's error is in every back-off"
+            "`exact` (a position shows the whole state, as printed) or `innovations` (back-offs contain the "
+            "covariance of the estimate's error)"
         ),
     ] = "exact"
     budgets: Annotated[
         Literal["certificate", "observed", "configured"],
         declare(
-            "risk of each age, with scheme `age-conditioned`: `certificate` holds on any link; `observed` "
-            "begins with it, and then counts on the link as observed; `configured` holds on a link as in `[link]`"
+            "risk of each age, with `age-conditioned`: `certificate` (holds on any link), `observed` (begins so, then "
+            "follows the observed link) or `configured` (holds on a link as in `[link]`)"
         ),
     ] = "observed"
     adapt: Annotated[
-        bool, declare("keep further from limits while they are left too often; not with budgets `configured`")
+        bool, declare("keep further from limits that are left too often; not with budgets `configured`")
     ] = True
 
 
 class SolverConfig(Section, frozen=True, kw_only=True):
-    """The solver of the decision problem."""
+    """Solver of the decision problem."""
 
     method: Annotated[
         Literal["exact", "printed"],
-        declare("`exact`: a frozen policy where proven optimal, else Clarabel; `printed`: (19) through CVXPY (slow)"),
+        declare(
+            "`exact` (a frozen policy where proven optimal, else Clarabel) or `printed` ((19) through CVXPY, slow)"
+        ),
     ] = "exact"
-    max_iterations: Annotated[
-        int, declare("most interior-point iterations (a time limit would not replay)", "", 1, 500)
-    ] = 100
+    max_iterations: Annotated[int, declare("most interior-point iterations", "", 1, 500)] = 100
 
 
 class TargetConfig(Section, frozen=True, kw_only=True):
-    """Target to fly to, unless `[mission]` says otherwise; the design's terminal set is checked there."""
+    """Target, unless `[mission]` has another; the design checks its terminal set there."""
 
-    position_m: Annotated[Position, declare("target in local NED [m]; axes that the plant lacks are ignored")]
+    position_m: Annotated[Position, declare("target in local NED; axes that the plant lacks are ignored", "m")]
 
 
 class EstimatorConfig(Section, frozen=True, kw_only=True):
@@ -274,35 +250,37 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     initial_std: Annotated[
         float, declare("standard deviation of states that no sample shows", "m/s, m/s²", 1e-9, 1000)
     ] = 0.5
-    window_s: Annotated[float, declare("samples later than this are dropped", "s", 0.001, 60)] = 2.0
-    max_position_m: Annotated[float, declare("a coordinate beyond counts as lost", "m", 0.001, 1e7)] = 1000.0
-    max_velocity_mps: Annotated[float, declare("a speed beyond counts as lost", "m/s", 0.001, 1e7)] = 100.0
+    window_s: Annotated[float, declare("samples that arrive later are dropped", "s", 0.001, 60)] = 2.0
+    max_position_m: Annotated[float, declare("a larger coordinate counts as lost", "m", 0.001, 1e7)] = 1000.0
+    max_velocity_mps: Annotated[float, declare("a larger speed counts as lost", "m/s", 0.001, 1e7)] = 100.0
     gate_sigma: Annotated[
         float,
         declare(
-            "standard deviations by which a position may miss the prediction, in addition to gate_m and the effect of "
-            "inputs; beyond, it counts as lost, and a repeated value as frozen",
+            "standard deviations by which a position may miss the prediction, besides gate_m and the effect of "
+            "inputs; else it counts as lost, a repeated value as frozen",
             "",
             0.001,
             1e6,
         ),
     ] = 6.0
-    gate_m: Annotated[float, declare("distance allowed in addition, for gusts", "m", 0, 1e6)] = 0.3
+    gate_m: Annotated[float, declare("distance allowed besides, for gusts", "m", 0, 1e6)] = 0.3
     bias_drift: Annotated[
         float,
         declare(
             "standard deviation that an unknown lasting acceleration (wind, hover thrust) gains in a second; it is "
-            "estimated and compensated; 0: none, as printed",
+            "estimated and compensated; 0: none",
             "input units/√s",
             0,
             1000,
         ),
     ] = 0.0
-    bias_max: Annotated[float, declare("part of each input that plans reserve for it", "input units", 0, 1000)] = 0.0
+    bias_max: Annotated[
+        float, declare("part of each input that plans reserve to compensate it", "input units", 0, 1000)
+    ] = 0.0
     bias_share: Annotated[
         float,
         declare(
-            "share of an input's half range that may compensate it, at least bias_max; above bias_max the setpoint "
+            "share of an input's half range that may compensate it, at least bias_max; beyond bias_max the setpoint "
             "limiter cuts plans",
             "",
             0,
@@ -311,54 +289,36 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     ] = 0.0
     inertial_std_mps2: Annotated[
         float,
-        declare(
-            "standard deviation of the acceleration by inertial sensors and attitude in a tick; 0: not used",
-            "m/s²",
-            0,
-            100,
-        ),
+        declare("standard deviation of the acceleration by inertial data, in a tick; 0: not used", "m/s²", 0, 100),
     ] = 0.0
     inertial_bias_mps2: Annotated[
-        float,
-        declare(
-            "standard deviation of their bias, which the filter estimates (1° of tilt is 0.17 m/s²)",
-            "m/s²",
-            high=100,
-            above=0,
-        ),
+        float, declare("standard deviation of its bias (1° of tilt is 0.17 m/s²)", "m/s²", high=100, above=0)
     ] = 0.1
     inertial_bias_s: Annotated[float, declare("correlation time of that bias", "s", 0.1, MAX_DURATION_S)] = 20.0
 
 
 class FallbackConfig(Section, frozen=True, kw_only=True):
-    """Fallback that takes over when the age of information reaches H."""
+    """Fallback when the age reaches H."""
 
-    brake_gain_1ps: Annotated[float, declare("deceleration per predicted speed while braking", "1/s", 1e-6, 1000)] = 1.5
+    brake_gain_1ps: Annotated[float, declare("deceleration per speed while braking", "1/s", 1e-6, 1000)] = 1.5
     brake_s: Annotated[float, declare("longest time of braking on the prediction", "s", 0, MAX_DURATION_S)] = 2.0
-    hold_s: Annotated[float, declare("then zero acceleration for this long", "s", 0, MAX_DURATION_S)] = 3.0
+    hold_s: Annotated[float, declare("zero acceleration after braking", "s", 0, MAX_DURATION_S)] = 3.0
     blind_hold_s: Annotated[
         float,
-        declare(
-            "longest hold without a recent position and a credible velocity of the vehicle", "s", 0, MAX_DURATION_S
-        ),
+        declare("longest hold with neither a recent position nor a credible vehicle velocity", "s", 0, MAX_DURATION_S),
     ] = 0.5
-    land: Annotated[bool, declare("then hand over to the vehicle's own landing mode (else hold on)")] = True
+    land: Annotated[bool, declare("then request the vehicle's landing mode (else hold)")] = True
     recover_samples: Annotated[int, declare("fresh samples in a row before plans are flown again", "", 1, 1000)] = 3
     jump_s: Annotated[
         float,
-        declare(
-            "time for which impossible positions must agree to count as a source that moved: brake, land",
-            "s",
-            0.001,
-            60,
-        ),
+        declare("impossible positions that agree for so long are a source that moved: brake, land", "s", 0.001, 60),
     ] = 1.2
 
 
 class LimitsConfig(Section, frozen=True, kw_only=True):
-    """The setpoint limiter on a setpoint."""
+    """The setpoint limiter."""
 
-    accel_mps2: Annotated[Position, declare("largest acceleration setpoint of each axis, north, east, down", "m/s²")]
+    accel_mps2: Annotated[Position, declare("largest acceleration setpoint north, east, down", "m/s²")]
     slew_mps3: Annotated[float, declare("largest change of a setpoint in a second, each axis", "m/s³", 1e-6, 1e6)]
 
 
@@ -366,10 +326,11 @@ Bound = Annotated[float, Meta(gt=0, le=1e6)] | None
 
 
 class EnvelopeConfig(Section, frozen=True, kw_only=True):
-    """Bounds of what is possible in flight; beyond them the vehicle is let go: level, then its own landing."""
+    """Bounds in flight; beyond them the vehicle is let go: level, then its own landing (docs/faults.md)."""
 
     outside_m: Annotated[
-        Bound, declare("how far the estimate may be outside `[sets]`; default: a tenth of the room, at least 0.5", "m")
+        Bound,
+        declare("largest distance of the estimate outside `[sets]`; default: a tenth of the room, at least 0.5", "m"),
     ] = None
     unexplained_mps2: Annotated[
         Bound,
@@ -382,15 +343,15 @@ class EnvelopeConfig(Section, frozen=True, kw_only=True):
     disagreement_mps: Annotated[
         Bound,
         declare(
-            "largest difference of the velocity by positions and the vehicle's own; default: unexplained_mps2 "
-            "for 0.17 s",
+            "largest difference between velocity by positions and vehicle velocity; default: unexplained_mps2 for "
+            "0.17 s",
             "m/s",
         ),
     ] = None
     lead_s: Annotated[
         float,
         declare(
-            "lead of the axis with the shorter way in a first motion: along one axis a mirrored frame shows", "s", 0, 10
+            "time of a first motion along its shorter horizontal axis alone, which shows a mirrored frame", "s", 0, 10
         ),
     ] = 0.3
 
