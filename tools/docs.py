@@ -112,7 +112,7 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
             key = f"{path}.{field.encode_name}" if path else field.encode_name
             needed = key in HAHN_STURSBERG_KEYS
             default = "required with `hahn-stursberg`" if needed else _describe_default(field, section, key)
-            yield "\n".join(wrap(_describe_key(field, default), 120, subsequent_indent="  ", break_on_hyphens=False))
+            yield _wrap_item(_describe_key(field, default))
     yield ""
     for field in fields:
         name = f"{path}.{field.encode_name}" if path else field.encode_name
@@ -121,6 +121,11 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
             yield from tables(one, f"[{name}]")
         elif is_section(field.type):
             yield from tables(field.type, name)
+
+
+def _wrap_item(text: str) -> str:
+    """Wrap an item of a Markdown list."""
+    return "\n".join(wrap(text, 120, subsequent_indent="  ", break_on_hyphens=False))
 
 
 # Endings of keys, and the unit that each of them states.
@@ -311,12 +316,11 @@ _STATES = {
 _EVENTS = {
     HandoverEvent.REBOOT: "the vehicle has restarted",
     HandoverEvent.LAND: "the controller, or the operator during the climb, requests landing",
-    HandoverEvent.UNSAFE: "in the climb: impossible positions (they jump, or contradict inertial data or the "
-    "vehicle's velocity), positions beyond the limits of `[sets]` by more than `envelope.outside_m`, or none for "
-    "a horizon",
+    HandoverEvent.UNSAFE: "in the climb: positions that jump, contradict inertial data or vehicle velocity, or are "
+    "outside `[sets]` by more than `envelope.outside_m`; or none for a horizon",
     HandoverEvent.GRANTED: "the request has taken effect",
-    HandoverEvent.REFUSED: "the vehicle refused for good, or not within tries and times of `[hand_over]`. Event "
-    "`refused` has its reason (COMMAND_ACK, STATUSTEXT); exit code 1",
+    HandoverEvent.REFUSED: "the vehicle refused for good, or did not react within `[hand_over]`; the event has its "
+    "reason (COMMAND_ACK, STATUSTEXT); exit code 1",
     HandoverEvent.SILENCE: "no heartbeat, or the last one is too old",
     HandoverEvent.TAKE_OFF: "`--arm --takeoff HEIGHT`; nothing else leads to arming",
     HandoverEvent.ENGAGE: "`uavctl ctl engage`; nothing else leads back from the pilot",
@@ -333,20 +337,20 @@ _EVENTS = {
 
 def hand_over_page() -> str:
     """The page docs/hand-over.md, made from the table."""
-    events = "\n".join(f"| `{event}` | {_EVENTS[event]} |" for event in HandoverEvent)
+    events = "\n".join(_wrap_item(f"* `{event}`: {_EVENTS[event]}") for event in HandoverEvent)
     return f"""# The hand-over between pilot and controller
 
-This page lists the states between the pilot, the vehicle's own modes and the controller. It is generated from
-`uavctl/mavlink/handover_states.py` (`make docs`); do not edit it.
+This page lists the states between the pilot, the vehicle's own modes and the controller. `make docs` generates it from
+`uavctl/mavlink/handover_states.py`.
 
 Example: `uavctl fly --arm --takeoff 1.2` goes from `READY` through `MODE`, `ARMING`, `CLIMBING` and `ENGAGING` to
 `ENGAGED`.
 
 ## States
 
-An event that is missing keeps the state.
+Each state has its events with the next state. Any other event keeps the state.
 
-{transitions_table()}
+{transitions_list()}
 Setpoints are sent in `ENGAGED` only. Neutral setpoints (zero acceleration) are sent where PX4 needs a stream before
 OFFBOARD: in `READY`, in the climb (not to ArduPilot, whose climb they would end) and in `RETURNING`. If heartbeats
 of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
@@ -355,19 +359,14 @@ of an engaged vehicle are missing, the controller brakes and holds, then sends n
 
 If several occur in a tick, the first of this list counts.
 
-| event | meaning |
-|---|---|
 {events}
 
 ## Take-off
 
-| | PX4 | ArduPilot |
-|---|---|---|
-| sequence | AUTO.TAKEOFF, arming, OFFBOARD | GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints |
-| the climb ends | when positions show the height, not at MIS_TAKEOFF_ALT | at nine tenths of the height |
+* PX4: AUTO.TAKEOFF, arming, OFFBOARD. The climb ends when positions show the height, not at MIS_TAKEOFF_ALT.
+* ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints. The climb ends at nine tenths of the height.
 
-After `unsafe` the vehicle is asked to land. Positions further from inertial data than noise explains are not
-relayed, until for 3 s all agree.
+Positions further from inertial data than noise explains are not relayed, until for 3 s all agree.
 
 ## Failsafes of the vehicle
 
@@ -375,27 +374,21 @@ Evidence: system status CRITICAL, "failsafe" or "fence breached" in a text, FENC
 the mode must be one that failsafes choose ({_modes(ModeChoice.EITHER)}), or one that nothing else chooses
 ({_modes(ModeChoice.FAILSAFE)}).
 
-| flight | reaction |
-|---|---|
-| began with `--arm`, failsafe ends in the climb | PX4 continues its climb, and so does the hand-over, within \
-`climb_s` |
-| began with `--arm`, failsafe lands | wait for `land_s` |
-| began with `--arm`, failsafe hovers, or has ended an engaged flight | request landing after `climb_s`, unless \
-`uavctl ctl engage` comes first |
-| began by the pilot | release the vehicle |
+A flight that the pilot began releases the vehicle. A flight with `--arm`:
+
+* The failsafe ends in the climb: PX4 continues its climb, and so does the hand-over, within `climb_s`.
+* The failsafe lands: wait for `land_s`.
+* It hovers, or has ended an engaged flight: request landing after `climb_s`, unless `uavctl ctl engage` comes first.
 
 ## Another mode
 
-| evidence | event | reaction |
-|---|---|---|
-| a stick or switch moved (RC_CHANNELS, a tenth of its way); a ground station ordered the mode; or only a person \
-chooses this mode, with a remote control whose channels the vehicle does not report | `other` | the person \
-flies; nothing is sent |
-| a failsafe explains the mode, and no stick moved ({_degrades()}) | `other` | the same; exit code 1 |
-| none of these | `unclear` | nothing is sent. After our take-off, landing is requested after `climb_s`, unless \
-a stick moves. Exit code 1 |
+* `other`, because a stick or switch moved (RC_CHANNELS, a tenth of its way), a ground station ordered the mode, or only
+  a person chooses this mode and the vehicle does not report its remote control's channels: the person flies.
+* `other`, because a failsafe explains the mode, and no stick moved ({_degrades()}): the same; exit code 1.
+* `unclear`, without such evidence: after our take-off, landing is requested after `climb_s`, unless a stick moves. Exit
+  code 1.
 
-The pilot's switch counts once a heartbeat shows it:
+In each case nothing is sent. The pilot's switch counts once a heartbeat shows it:
 
 * A request for the external mode or for landing is repeated only right after a heartbeat, so that a switch shows
   first.
@@ -406,9 +399,9 @@ The pilot's switch counts once a heartbeat shows it:
 
 ## Landing
 
-Once the vehicle shows that it lands, another mode is the pilot's. After landing was granted this holds at once, or
-after 2 s for the mode of before. A vehicle that we took off is asked to land while it is heard armed, up to ten
-times `land_s`; the end of `land_s` is reported. Landing is requested without heartbeats, too.
+Once the vehicle shows that it lands, another mode is the pilot's; the mode of before counts so only after 2 s. A
+vehicle that we took off is asked to land while it is heard armed, also without heartbeats, up to ten times `land_s`.
+The end of `land_s` is reported.
 """
 
 
@@ -422,13 +415,14 @@ def _modes(choice: ModeChoice) -> str:
 
 
 def _degrades() -> str:
-    """The modes of a person that a failsafe chooses as well, by autopilot."""
-    return "; ".join(f"{name}: {', '.join(sorted(profile.degraded_modes))}" for name, profile in PROFILES.items())
+    """The modes of a person that a failsafe chooses as well, by autopilot; AUTO.EXTERNAL1 and its like as one."""
+    names = {name: sorted({mode.rstrip("0123456789") for mode in one.degraded_modes}) for name, one in PROFILES.items()}
+    return "; ".join(f"{name}: {', '.join(modes)}" for name, modes in names.items())
 
 
-def transitions_table() -> str:
-    """Every way from one state to another as a Markdown table, by event."""
-    lines = ["| state | meaning | event: next state |", "|---|---|---|"]
+def transitions_list() -> str:
+    """Every way from one state to another as a Markdown list, by event."""
+    lines = []
     for before in HandoverState:
         ways: dict[HandoverState, list[str]] = {}
         for event in HandoverEvent:
@@ -436,7 +430,7 @@ def transitions_table() -> str:
             if after is not before:
                 ways.setdefault(after, []).append(f"`{event}`")
         cells = "; ".join(f"{', '.join(events)}: {after.name}" for after, events in ways.items())
-        lines.append(f"| `{before.name}` | {_STATES[before]} | {cells or 'end'} |")
+        lines.append(_wrap_item(f"* **`{before.name}`**: {_STATES[before]}. {cells or 'End'}."))
     return "\n".join(lines) + "\n"
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from docs import PAGES, topics_page, transitions_table
+from docs import PAGES, topics_page, transitions_list
 from logs.recording.derived_topics import PLOTS, VIEWS
 from logs.recording.topics import TOPICS
-from uavctl.mavlink.handover_states import TRANSITIONS
+from uavctl.mavlink.handover_states import TRANSITIONS, HandoverState
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -19,14 +19,15 @@ def test_a_page_is_up_to_date(page: Path) -> None:
     assert page.read_text(encoding="utf-8") == PAGES[page](), "run `make docs`"
 
 
-def test_the_table_of_the_hand_over_has_every_transition_once() -> None:
-    rows = [line.strip("| ").split(" | ") for line in transitions_table().splitlines()[2:]]
+def test_the_list_of_the_hand_over_has_every_transition_once() -> None:
+    items = re.findall(r"^\* \*\*`(\w+)`\*\*: [^.]+\. (.+)\.$", transitions_list().replace("\n  ", " "), re.MULTILINE)
     ways = [
-        (before.strip("`"), event.strip("`"), after)
-        for before, _, cell in rows
+        (before, event, after)
+        for before, cell in items
         for events, _, after in (way.partition(": ") for way in cell.split("; ") if ": " in way)
-        for event in events.split(", ")
+        for event in events.replace("`", "").split(", ")
     ]
+    assert [before for before, _ in items] == [state.name for state in HandoverState]
     assert len(set(ways)) == len(ways)
     assert set(ways) == {
         (before.name, event, after.name) for (before, event), (after, _) in TRANSITIONS.items() if before is not after
