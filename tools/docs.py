@@ -189,6 +189,7 @@ def _describe_type(field: FieldInfo, *, is_shown: bool) -> str:
     text = re.sub(r"\(<= (\S+)\)", r"to \1", text).replace("e-0", "e-").replace('" or "', '", "')
     text = text.replace("whole number", "integer").replace("list of lists", "lists")
     text = re.sub("^list of string$", "strings", text).replace("list of ", "")
+    text = re.sub(r"^number (?=\S)", "", text)  # a range shows it
     if is_shown:
         text = re.sub(r"^(true or false|string|(integer|\d? ?numbers?) ?)", "", text).removeprefix(", ")
     return text
