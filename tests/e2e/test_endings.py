@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -561,12 +562,12 @@ def test_a_cut_off_end_has_its_own_cause() -> None:
 
 def test_the_table_of_the_documentation_has_every_cause_with_its_exit_code() -> None:
     page = (ROOT / "docs" / "operation.md").read_text(encoding="utf-8")
-    table = page.partition("| the sentence begins with |")[2].partition("\n\n")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "---" not in line]
-    ends = {cause: text.phrase for cause, text in CAUSES.items() if text.phrase}
-    for cause in ends.keys() - {Cause.WAITING, Cause.SIGNALLED}:
-        (row,) = [row for row in rows if row[0].partition(" (")[0] == ends[cause]]
-        assert row[1:] == [f"`{cause}`", str(make_ending(cause, "").exit_code)], cause
+    table = page.partition("| exit code | `code` |\n|---|---|\n")[2].partition("\n\n")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines()]
+    codes = [(cause, title.partition(",")[0]) for title, cell in rows for cause in re.findall(r"`([a-z-]+)`", cell)]
+    listed = [(cause, code) for cause, code in codes if cause in CAUSES and cause != Cause.SIGNALLED]
+    ends = {cause for cause, text in CAUSES.items() if text.phrase} - {Cause.WAITING, Cause.SIGNALLED}
+    assert sorted(listed) == sorted((cause, str(make_ending(cause, "").exit_code)) for cause in ends)
 
 
 @pytest.mark.slow
