@@ -92,7 +92,29 @@ _FLIGHTS = """# Keys of a campaign of flights
 With `world = "quadrotor"` a campaign flies the simulated quadrotor. Its file has these keys instead; `[[link]]` is as
 above.
 """
-_RAW_TEXT = "datagrams of connection `<link>`; log time is the time of receiving or sending"
+_TOPICS = """# Topics of a recording
+
+This page lists the topics of an MCAP file and their fields. It is generated (`make docs`). To see the topics of a
+recording:
+
+```sh
+uavctl log info FLIGHT
+```
+
+Records are JSON, with their schemas in the file. [Times](recordings.md#times) in records are nanoseconds of a monotonic
+clock. Numbers have the digits that give the same float back. NaN and infinities are the strings `"NaN"`, `"Infinity"`,
+`"-Infinity"`. `[]` is a list. A field with `?` may be null.
+
+`/raw/<link>/in` and `/raw/<link>/out` are the datagrams (MAVLink) of connection `<link>`; log time is the time of
+receiving or sending.
+"""
+_VIEWS = """# Topics for viewers
+
+These topics are made from the records above for [viewers](viewers.md), as protobuf. No replay and no report reads them.
+Positions are local NED, in frame `ned`; look from frame `room` (east, north, up). NaN: no number.
+
+| topic | schema | content |
+|---|---|---|"""
 
 
 def configuration_page() -> str:
@@ -225,71 +247,43 @@ def campaign_page() -> str:
 
 def topics_page() -> str:
     """The page docs/topics.md, made from the rows."""
-    lines = [
-        "# Topics of a recording",
-        "",
-        "This page lists the topics of an MCAP file and their fields. To see those of a recording:",
-        "",
-        "```sh",
-        "uavctl log info FLIGHT",
-        "```",
-        "",
-        "Records are JSON, with their schemas in the file; raw topics are MAVLink. [Times](recordings.md#times) in",
-        "records are nanoseconds of a monotonic clock. Numbers have the digits that give the same float back. NaN and",
-        'infinities are the strings `"NaN"`, `"Infinity"`, `"-Infinity"`; `null` is a missing value. This page is',
-        "generated (`make docs`).",
-        "",
-        "| topic | record | content |",
-        "|---|---|---|",
-        f"| `/raw/<link>/in`, `/raw/<link>/out` | `Datagram` | {_RAW_TEXT} |",
-        *(f"| `{topic.name}` | `{topic.record.__name__}` | {topic.text} |" for topic in TOPICS),
-        "",
-    ]
+    lines, plots = [_TOPICS], list[str]()
     for topic in TOPICS:
         properties = msgspec.json.decode(get_definition(topic.name).schema)["properties"]
         fields = {name: _json_type(schema) for name, schema in properties.items()}
-        lines += _list_fields(topic.name, fields)
-    return "\n".join([*lines, *_views_section()])
-
-
-def _views_section() -> list[str]:
-    lines = [
-        "# Topics for viewers",
-        "",
-        "These topics are made from the records above for [viewers](viewers.md), as protobuf. No replay and no",
-        "report reads them. Positions are local NED, in frame `ned`; look from frame `room` (east, north, up). NaN: no",
-        "number.",
-        "",
-        "| topic | schema | content |",
-        "|---|---|---|",
-        *(f"| `{view.name}` | `{view.schema_name}` | {view.text} |" for view in VIEWS),
-        "",
-    ]
+        lines += _describe_topic(topic.name, f"`{topic.record.__name__}`: {topic.text}.", fields)
+    lines += [_VIEWS]
     for view in VIEWS:
         if issubclass(view.kind, Record):
-            fields = {field.name: field.type.__name__ for field in msgspec.structs.fields(view.kind)}
-            lines += _list_fields(view.name, fields)
-    return lines
+            plotted = {field.name: (field.type.__name__, False) for field in msgspec.structs.fields(view.kind)}
+            plots += _describe_topic(view.name, f"`{view.schema_name}`: {view.text}.", plotted)
+        else:
+            lines.append(f"| `{view.name}` | `{view.schema_name}` | {view.text} |")
+    return "\n".join([*lines, "", *plots])
 
 
-def _list_fields(topic: str, fields: dict[str, str]) -> list[str]:
-    """Return the section of a topic: its fields with their types."""
-    text = "; ".join(f"`{name}` {kind}" for name, kind in fields.items())
-    return [f"## `{topic}`", "", *wrap(f"Fields: {text}.", 120), ""]
+def _describe_topic(topic: str, text: str, fields: dict[str, tuple[str, bool]]) -> list[str]:
+    """Return the section of a topic: its content, and the names of its fields by type."""
+    names: dict[str, list[str]] = {}
+    for name, (kind, is_optional) in fields.items():
+        names.setdefault(kind, []).append(f"`{name}`{'?' if is_optional else ''}")
+    groups = "; ".join(f"{kind} {', '.join(group)}" for kind, group in names.items())
+    return [f"## `{topic}`", "", *wrap(text, 120), "", *wrap(f"Fields: {groups}.", 120), ""]
 
 
-def _json_type(schema: dict[str, object]) -> str:
-    """One field's type in words."""
+def _json_type(schema: dict[str, object]) -> tuple[str, bool]:
+    """Return one field's type in words, and whether it may be null."""
     if "$ref" in schema:
-        return f"`{cast('str', schema['$ref']).rpartition('/')[2]}`"
+        return f"`{cast('str', schema['$ref']).rpartition('/')[2]}`", False
     if "anyOf" in schema:
-        return " or ".join(_json_type(one) for one in cast("list[dict[str, object]]", schema["anyOf"]))
+        kinds = [_json_type(one)[0] for one in cast("list[dict[str, object]]", schema["anyOf"])]
+        return " or ".join(kind for kind in kinds if kind != "null"), "null" in kinds
     kind = cast("str", schema.get("type", "any"))
     if kind == "array":
-        return f"array of {_json_type(_items(schema))}"
+        return f"{_json_type(_items(schema))[0]}[]", False
     if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
-        return f"object of {_json_type(cast('dict[str, object]', schema['additionalProperties']))}"
-    return kind
+        return f"object of {_json_type(cast('dict[str, object]', schema['additionalProperties']))[0]}", False
+    return kind, False
 
 
 def _items(schema: dict[str, object]) -> dict[str, object]:

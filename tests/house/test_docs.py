@@ -34,23 +34,32 @@ def test_the_list_of_the_hand_over_has_every_transition_once() -> None:
     }
 
 
+def read_section(page: str, topic: str) -> str:
+    """The section of a topic, as one line."""
+    assert page.count(f"## `{topic}`\n") == 1
+    return " ".join(page.split(f"## `{topic}`\n")[1].split("\n#")[0].split())
+
+
 def test_page_lists_every_topic_and_field() -> None:
     page = topics_page()
     for topic in TOPICS:
-        assert page.count(f"| `{topic.name}` |") == 1
-        section = " ".join(page.split(f"## `{topic.name}`")[1].split("## ")[0].split())
-        for field in msgspec.structs.fields(topic.record):
-            assert re.search(rf"(Fields:|;) `{field.name}` \S", section)
-    words = " ".join(page.split())
-    assert "; `position_m` array of number;" in words
-    assert "; `solve` `SolveStatus` or null;" in words
+        section = read_section(page, topic.name)
+        assert section.startswith(f"`{topic.record.__name__}`: {topic.text}. Fields: ")
+        fields = re.findall(r"[ ;]`(\w+)`\??(?=[,;.])", section.partition(" Fields: ")[2])
+        assert sorted(fields) == sorted(field.name for field in msgspec.structs.fields(topic.record))
+    assert "; number[] `accel_mps2`; number `yaw_rad`?; `SetpointSource` `source`; " in read_section(
+        page, "/uavctl/setpoint"
+    )
 
 
 def test_page_lists_every_topic_for_viewers_and_every_field_to_plot() -> None:
     page = topics_page()
     for view in VIEWS:
-        assert page.count(f"| `{view.name}` | `{view.schema_name}` |") == 1
+        if view.name in PLOTS.values():
+            assert read_section(page, view.name).startswith(f"`{view.schema_name}`: {view.text}. Fields: ")
+        else:
+            assert page.count(f"| `{view.name}` | `{view.schema_name}` | {view.text} |") == 1
     for kind, name in PLOTS.items():
-        section = " ".join(page.split(f"## `{name}`")[1].split("## ")[0].split())
+        section = read_section(page, name)
         for field in msgspec.structs.fields(kind):
-            assert re.search(rf"(Fields:|;) `{field.name}` \S", section)
+            assert re.search(rf" `{field.name}`[,;.]", section)
