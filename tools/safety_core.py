@@ -49,14 +49,15 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }
 
 
-def what_is_not_run(module: str) -> str:
-    """Run the tests of a module alone; return what they printed if one fails or a branch is not run, else nothing."""
+def what_is_not_run(tests: tuple[str, ...]) -> str:
+    """Run the tests of some modules alone, once; return what they printed if one fails or a branch is not run."""
+    modules = ",".join(module for module, own in TARGETS.items() if own == tests)
     with tempfile.TemporaryDirectory() as folder:
         coverage = [sys.executable, "-m", "coverage"]
         data = f"--data-file={folder}/coverage"
-        tests = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *TARGETS[module]]
         commands = (
-            [*coverage, "run", data, "--branch", f"--include={module}", *tests],
+            [*coverage, "run", data, "--branch", f"--include={modules}"]
+            + ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *tests],
             [*coverage, "report", data, "--show-missing", "--fail-under=100"],
         )
         for command in commands:
