@@ -54,12 +54,12 @@ class Source:
 
 
 @pytest.mark.fault(10)
-@pytest.mark.parametrize("bit", range(len(GOOD) * 8))
-def test_row_10_one_flipped_bit_costs_one_sample_and_the_next_is_read(bit: int) -> None:
-    link = make_link()
-    assert samples(link.receive(flip_byte(GOOD, bit), NOW).items) == []
-    assert len(samples(link.receive(GOOD, NOW + MS).items)) == 1
-    assert sum(link.stats(NOW).bad.values()) == 1
+def test_row_10_one_flipped_bit_costs_one_sample_and_the_next_is_read() -> None:
+    for bit in range(len(GOOD) * 8):
+        link = make_link()
+        assert samples(link.receive(flip_byte(GOOD, bit), NOW).items) == [], bit
+        assert len(samples(link.receive(GOOD, NOW + MS).items)) == 1, bit
+        assert sum(link.stats(NOW).bad.values()) == 1, bit
 
 
 @pytest.mark.fault(11)

@@ -131,8 +131,6 @@ HOME = {"px4": px4(4, 5), "ardupilot": 6}
 
 
 @BOTH
-@pytest.mark.parametrize("severity", range(8))
-@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
     ("text", "who"),
     [
@@ -148,20 +146,19 @@ HOME = {"px4": px4(4, 5), "ardupilot": 6}
         ("Takeoff detected", ModeReason.UNKNOWN),
     ],
 )
-def test_its_own_words_of_any_severity_before_and_after_the_mode(
-    autopilot: str, severity: int, late: bool, text: str, who: ModeReason
-) -> None:
-    vehicle = Vehicle(autopilot)
-    if not late:
-        vehicle.text(text, severity)
-    vehicle.now_ns += SECOND // 10
-    vehicle.beat(HOME[autopilot])
-    if late:
-        vehicle.text(text, severity)
-    assert vehicle.who() is who
-    vehicle.now_ns += 3 * SECOND
-    vehicle.beat(HOME[autopilot])
-    assert vehicle.who() is ModeReason.UNKNOWN  # that was another time
+def test_its_own_words_of_any_severity_before_and_after_the_mode(autopilot: str, text: str, who: ModeReason) -> None:
+    for severity, late in product(range(8), (False, True)):
+        vehicle = Vehicle(autopilot)
+        if not late:
+            vehicle.text(text, severity)
+        vehicle.now_ns += SECOND // 10
+        vehicle.beat(HOME[autopilot])
+        if late:
+            vehicle.text(text, severity)
+        assert vehicle.who() is who, (severity, late)
+        vehicle.now_ns += 3 * SECOND
+        vehicle.beat(HOME[autopilot])
+        assert vehicle.who() is ModeReason.UNKNOWN, (severity, late)  # that was another time
 
 
 @BOTH
