@@ -120,16 +120,15 @@ def test_a_good_one_flies_to_the_target(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_corner", [False, True])
 @pytest.mark.parametrize(
-    ("preset", "autopilot", "from_wall_m"),
+    ("preset", "autopilot", "from_wall_m", "is_corner"),
     [
-        ("room", "px4", 0.2),
-        ("room", "ardupilot", 0.2),
-        ("room-px4", "px4", 0.2),
-        ("room-ardupilot", "ardupilot", 0.2),
-        ("room-hahn-stursberg", "px4", 0.8),  # the design of its scheme has no target that is nearer
-        ("room-hahn-stursberg", "ardupilot", 0.8),
+        ("room", "px4", 0.2, True),
+        ("room", "ardupilot", 0.2, False),
+        ("room-px4", "px4", 0.2, False),
+        ("room-ardupilot", "ardupilot", 0.2, True),
+        ("room-hahn-stursberg", "px4", 0.8, True),  # the design of its scheme has no target that is nearer
+        ("room-hahn-stursberg", "ardupilot", 0.8, False),
     ],
 )
 def test_the_regulator_of_the_docs_reaches_walls_and_corners_in_gusts(
