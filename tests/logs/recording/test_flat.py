@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from flat_rig import tabulate
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from record_values import values
 
@@ -68,6 +68,7 @@ def expect(row: dict[str, Cell], record: msgspec.Struct) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 def test_every_value_of_every_record_is_in_its_column(topic: Topic) -> None:
+    @settings(max_examples=30)  # of up to three records
     @given(st.lists(values(topic.record), min_size=1, max_size=3))
     def check(drawn: list[object]) -> None:
         records = [record for record in drawn if isinstance(record, Record)]

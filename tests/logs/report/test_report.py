@@ -125,17 +125,18 @@ def test_a_flight_of_ours_is_judged(judged_html: str) -> None:
     assert not seen.tags & {"link", "img"}
 
 
-def test_slack_is_drawn(room_flight: FlightData) -> None:
-    some = list(room_flight.flown_plans.values())[:2]
+def test_slack_is_drawn() -> None:
+    flight = data(room(), 8.0)
+    some = list(flight.flown_plans.values())[:2]
     gave = [msgspec.structs.replace(plan, slack=slack) for plan, slack in zip(some, (0.2, 0.1), strict=True)]
-    plans = (*gave, *(plan for plan in room_flight.plans if plan.seq not in {plan.seq for plan in gave}))
-    seen = read_page_text(dataclasses.replace(room_flight, plans=plans))
+    plans = (*gave, *(plan for plan in flight.plans if plan.seq not in {plan.seq for plan in gave}))
+    seen = read_page_text(dataclasses.replace(flight, plans=plans))
     assert "plan-slack" in seen.plots
 
 
-def test_checks_before_arming_are_listed(room_flight: FlightData) -> None:
+def test_checks_before_arming_are_listed() -> None:
     check = Checked(at_ns=0, name="battery", state="good", value="15.2 V", want="above 14 V", hint="")
-    text = " ".join(read_page_text(dataclasses.replace(room_flight, checks=(check,))).text)
+    text = " ".join(read_page_text(dataclasses.replace(data(paper(), 3.0), checks=(check,))).text)
     assert "Checked before arming" in text and "above 14 V" in text
 
 
@@ -237,18 +238,14 @@ def test_positions_that_were_refused_are_not_drawn() -> None:
     assert set(after) < set(before)
 
 
-def test_report_is_written_as_utf8(tmp_path: Path, room_flight: FlightData) -> None:
-    out = tmp_path / "flight.html"
+def test_report_is_written_as_utf8_or_it_is_told_that_it_cannot_be(tmp_path: Path) -> None:
+    flight, out, nowhere = data(paper(), 3.0), tmp_path / "flight.html", tmp_path / "missing" / "flight.html"
     with omit_figures():
-        write_report(room_flight, summarise(room_flight, wall_s=1.0), out)
-        assert out.read_text(encoding="utf-8") == make_html(room_flight)
-
-
-def test_a_page_that_cannot_be_written_is_told(tmp_path: Path, room_flight: FlightData) -> None:
-    out = tmp_path / "missing" / "flight.html"
-    with omit_figures(), pytest.raises(RecordingError) as told:
-        write_report(room_flight, summarise(room_flight, wall_s=1.0), out)
-    assert str(told.value).startswith(f"{out}: cannot be written (No such file")
+        write_report(flight, summarise(flight, wall_s=1.0), out)
+        assert out.read_text(encoding="utf-8") == make_html(flight)
+        with pytest.raises(RecordingError) as told:
+            write_report(flight, summarise(flight, wall_s=1.0), nowhere)
+    assert str(told.value).startswith(f"{nowhere}: cannot be written (No such file")
 
 
 def test_picture_is_a_file_of_its_own(room_flight: FlightData) -> None:
