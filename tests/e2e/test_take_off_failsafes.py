@@ -18,7 +18,7 @@ from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import ControlMode, Order, Severity
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-SEEDS = 10
+SEEDS = 6
 
 
 @pytest.mark.slow

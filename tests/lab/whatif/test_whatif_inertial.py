@@ -170,8 +170,11 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [LINEAR, LINEAR_ARDUPILOT], ids=["px4", "ardupilot"])
-@pytest.mark.parametrize("change", [ELSEWHERE, "cost.input=[3.0, 3.0, 3.0]"], ids=["target", "cost"])
+@pytest.mark.parametrize(
+    ("case", "change"),
+    [(LINEAR, ELSEWHERE), (LINEAR_ARDUPILOT, "cost.input=[3.0, 3.0, 3.0]")],
+    ids=["px4-target", "ardupilot-cost"],
+)
 def test_on_the_linear_plant_rewritten_inertial_data_equal_those_of_a_flight(case: Case, change: str) -> None:
     memory, course = fly_again(case, change)
     real = fly_case(case, change)
