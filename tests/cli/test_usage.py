@@ -17,7 +17,7 @@ from places import ROOT
 from rich.console import Console
 
 from uavctl.cli.app import app, run
-from uavctl.cli.common import label_text, make_message_console, make_output_console, make_pair_table, make_table
+from uavctl.cli.output import label_text, make_message_console, make_output_console, make_pair_table, make_table
 from uavctl.cli.usage import EXAMPLES, format_example, list_commands
 from uavctl.config.load import find_keys
 from uavctl.frames import suggest_height_sign
@@ -198,4 +198,4 @@ def test_consoles_are_made_at_one_place_where_markup_is_off() -> None:
     for file in (ROOT / "uavctl").rglob("*.py"):
         text = file.read_text(encoding="utf-8")
         assert "rich.markup" not in text
-        assert "Console(" not in text or file.name == "common.py", file
+        assert "Console(" not in text or file.name == "output.py", file

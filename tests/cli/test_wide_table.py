@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console, Group, RenderableType
 
-from uavctl.cli.common import DEFAULTS, Column, WideTable, make_pair_table, make_table
+from uavctl.cli.common import DEFAULTS
 from uavctl.cli.design import _make_column, make_plan_table
+from uavctl.cli.output import Column, WideTable, make_pair_table, make_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design

@@ -12,7 +12,8 @@ from typing import Annotated
 from cyclopts import App, CycloptsError, Parameter
 
 from uavctl import __version__
-from uavctl.cli.common import (
+from uavctl.cli.error_stream import limit_output_wait
+from uavctl.cli.output import (
     label_text,
     make_output_console,
     make_pair_table,
@@ -20,22 +21,22 @@ from uavctl.cli.common import (
     reserve_stdout,
     write_document,
 )
-from uavctl.cli.error_stream import limit_output_wait
-from uavctl.cli.usage import describe_unknown_command, describe_unknown_option, explain_error, format_example
-from uavctl.config.load import find_nearest
+from uavctl.cli.usage import EXAMPLES, describe_unknown_command, describe_unknown_option, explain_error, format_example
 from uavctl.errors import ConfigError, OutputError, UavctlError, UsageError, in_words
 
-_HELP = """Stochastic model predictive flight control shaped by the age of information, over MAVLink.
-
-Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
-4 `tune`: the pilot has taken over; 130 interrupted. With --json, standard output holds one JSON document and nothing
-else, also of an error. `uavctl docs` has the manual."""
+# Plain text: to load a reader of Markdown takes a quarter of the time of help.
+_HELP = (
+    "Stochastic model predictive flight control shaped by the age of information, over MAVLink.\n\n"
+    "Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss; 4 tune: the "
+    "pilot has taken over; 130 interrupted. With --json, standard output holds one JSON document and nothing else, "
+    "also of an error. uavctl docs has the manual."
+)
 
 app = App(
     name="uavctl",
     help=_HELP,
-    help_epilogue=format_example(""),
-    help_format="markdown",
+    help_epilogue=f"Example: {EXAMPLES['']}",
+    help_format="plaintext",
     version=__version__,
     suppress_keyboard_interrupt=False,
 )
@@ -69,8 +70,8 @@ _COMMANDS = {
 _USAGES = {"docs": {"usage": "Usage: uavctl docs [PAGE]"}}
 for _name, (_path, _help) in _COMMANDS.items():
     # A command with subcommands is an application and has its own help.
-    _options = {} if _path.endswith("_app") else {"help_epilogue": format_example(_name), **_USAGES.get(_name, {})}
-    app.command(f"uavctl.cli.{_path}", name=_name, help=_help, **_options)
+    _options = {"help_epilogue": format_example(_name), "help_format": "markdown", **_USAGES.get(_name, {})}
+    app.command(f"uavctl.cli.{_path}", name=_name, help=_help, **({} if _path.endswith("_app") else _options))
 
 app.register_install_completion_command(add_to_startup=False)
 
@@ -78,6 +79,8 @@ app.register_install_completion_command(add_to_startup=False)
 def docs(page: Annotated[str, Parameter(help="name of a page; else all of them are listed")] = "", /) -> int:
     """Show a page of the manual, or list its pages; in a pipe or file as Markdown."""
     from rich.markdown import Markdown
+
+    from uavctl.config.load import find_nearest  # loads numpy, which help does not need
 
     folder = Path(__file__).parents[1] / "docs"
     pages = {path.stem: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md"))}

@@ -10,7 +10,8 @@ import msgspec
 from cyclopts import Parameter
 from rich.console import Group, RenderableType
 
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, locate_design_errors, make_progress, make_table
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, locate_design_errors, make_progress
+from uavctl.cli.output import make_table
 from uavctl.errors import UavctlError
 from uavctl.lab.bench.decision import DecisionBench, time_decision
 from uavctl.lab.bench.tick import TickBench, time_tick

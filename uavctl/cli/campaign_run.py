@@ -18,7 +18,8 @@ from rich.console import Group, RenderableType
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uavctl.cli import INTERRUPTED
-from uavctl.cli.common import Common, make_progress, make_table, print_message
+from uavctl.cli.common import Common, make_progress
+from uavctl.cli.output import make_table, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report

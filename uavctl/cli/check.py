@@ -22,17 +22,9 @@ from logs.recording.parameters import ParameterReader, make_parameter_records
 from logs.recording.topics import PARAMETER
 from uavctl.check.findings import Item, ItemState, describe_item, find_refusals, judge_item, make_item
 from uavctl.check.preflight import Preflight
-from uavctl.cli.common import (
-    DEFAULTS,
-    SPAN_S,
-    Common,
-    Mocap,
-    label_text,
-    locate_design_errors,
-    make_key_overrides,
-    print_message,
-)
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, locate_design_errors, make_key_overrides
 from uavctl.cli.flight_risk import Rehearsals, RiskSeed, compute_flight_risk
+from uavctl.cli.output import label_text, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config

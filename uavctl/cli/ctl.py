@@ -12,7 +12,8 @@ import msgspec
 from cyclopts import App, Parameter
 from rich.table import Table
 
-from uavctl.cli.common import Common, QuietJson, make_pair_table, print_message
+from uavctl.cli.common import Common, QuietJson
+from uavctl.cli.output import make_pair_table, print_message
 from uavctl.cli.usage import format_example
 from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, find_control_folder
 from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
@@ -28,6 +29,7 @@ ctl_app = App(
     name="ctl",
     help="Orders to a flight that goes on: goto, hold, resume, land, engage; and its status.",
     help_epilogue=format_example("ctl"),
+    help_format="markdown",
 )
 
 

@@ -14,17 +14,9 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from uavctl.arrays import Array
-from uavctl.cli.common import (
-    DEFAULTS,
-    Column,
-    Common,
-    WideTable,
-    locate_design_errors,
-    make_key_overrides,
-    make_message_console,
-    make_table,
-)
+from uavctl.cli.common import DEFAULTS, Common, locate_design_errors, make_key_overrides
 from uavctl.cli.flight_risk import Rehearsals, RiskSeed, compute_flight_risk
+from uavctl.cli.output import Column, WideTable, make_message_console, make_table
 from uavctl.config import Config
 from uavctl.constraint_names import describe_all_relaxed
 from uavctl.errors import UsageError

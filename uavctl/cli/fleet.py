@@ -27,18 +27,10 @@ from rich.live import Live
 from rich.table import Table
 
 from uavctl.cli import main
-from uavctl.cli.common import (
-    SPAN_S,
-    Common,
-    QuietJson,
-    TakeOff,
-    make_key_overrides,
-    make_message_console,
-    make_table,
-    print_message,
-)
+from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, make_key_overrides
 from uavctl.cli.ctl import send_request
 from uavctl.cli.health_lines import hide_health_lines
+from uavctl.cli.output import make_message_console, make_table, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.usage import format_example
 from uavctl.config import Config, load
@@ -60,6 +52,7 @@ fleet_app = App(
     name="fleet",
     help="Fly several vehicles from one file: check, fly, status, land.",
     help_epilogue=format_example("fleet"),
+    help_format="markdown",
 )
 File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] table for each vehicle")]
 

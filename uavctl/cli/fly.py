@@ -14,17 +14,7 @@ from logs.recording.recorder import Recorder
 from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from uavctl.check.findings import Item
-from uavctl.cli.common import (
-    DEFAULTS,
-    SPAN_S,
-    Common,
-    Mocap,
-    TakeOff,
-    label_text,
-    locate_design_errors,
-    make_key_overrides,
-    print_message,
-)
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, locate_design_errors, make_key_overrides
 from uavctl.cli.error_stream import limit_output_wait
 from uavctl.cli.flying import (
     Live,
@@ -41,6 +31,7 @@ from uavctl.cli.flying import (
     wait_for_server,
 )
 from uavctl.cli.live_line import show_live_line
+from uavctl.cli.output import label_text, print_message
 from uavctl.cli.services import enable_realtime_process, run_services
 from uavctl.cli.signals import ignore_stopping_signals, stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns

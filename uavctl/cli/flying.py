@@ -21,7 +21,8 @@ from logs.recording.reader import read
 from logs.recording.recorder import DerivedTopics, RecorderStatus
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import ViewBuilder
-from uavctl.cli.common import FREE_PORT, label_text, print_message
+from uavctl.cli.common import FREE_PORT
+from uavctl.cli.output import label_text, print_message
 from uavctl.cli.signals import SIGNAL_EXIT_BASE, stop_on_signals
 from uavctl.daemon.flight_orders import make_goto_keys
 from uavctl.errors import ConnectionClosedError, TickOverdueError, UavctlError, UsageError, in_words

@@ -18,7 +18,8 @@ from logs.recording.output_files import refuse_recording_path, write_atomically
 from logs.recording.reader import explain_missing_end, read, read_header
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
-from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_pair_table, make_progress, make_table, warn
+from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_progress
+from uavctl.cli.output import make_pair_table, make_table, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse_recorded
 from uavctl.errors import DesignError, UsageError

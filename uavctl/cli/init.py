@@ -12,7 +12,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from uavctl.check.parameters import compute_max_accel_mps2
-from uavctl.cli.common import print_message
+from uavctl.cli.output import print_message
 from uavctl.config import parse
 from uavctl.errors import UsageError
 from uavctl.wiring.controller import MIN_OUTSIDE_M, build_flight_design, compute_reference_limits

@@ -12,7 +12,12 @@ from uavctl.cli.common import Common, Json
 from uavctl.cli.usage import format_example
 from uavctl.io.key_file import new_key, read_key
 
-key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.", help_epilogue=format_example("key"))
+key_app = App(
+    name="key",
+    help="Make and look at keys of MAVLink 2 signing.",
+    help_epilogue=format_example("key"),
+    help_format="markdown",
+)
 
 
 @key_app.command(help_epilogue=format_example("key new"))

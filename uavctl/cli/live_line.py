@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsed
 from rich.text import Text
 
 from logs.recording.recorder import RecorderStatus
-from uavctl.cli.common import label_text, make_message_console
+from uavctl.cli.output import label_text, make_message_console
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import ControlMode, Event, Severity, Ticked

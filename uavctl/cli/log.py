@@ -29,18 +29,8 @@ from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
 from logs.recording.ulog import is_ulog
 from logs.report.findings import Headline
-from uavctl.cli.common import (
-    Common,
-    Flight,
-    Json,
-    System,
-    format_counts,
-    make_headline_text,
-    make_pair_table,
-    make_progress,
-    make_table,
-    warn,
-)
+from uavctl.cli.common import Common, Flight, Json, System, make_progress
+from uavctl.cli.output import format_counts, make_headline_text, make_pair_table, make_table, warn
 from uavctl.cli.usage import format_example
 from uavctl.errors import UsageError
 
@@ -197,6 +187,7 @@ log_app = App(
     name="log",
     help="Recordings: info, recover, replay, report, compare, whatif, export; a layout.",
     help_epilogue=format_example("log"),
+    help_format="markdown",
 )
 # A module is imported when its command runs: a replay does not load what draws pages.
 _COMMANDS = {

@@ -41,21 +41,9 @@ from logs.report.tlog_headline import derive_tlog_headline
 from logs.report.tlog_page import write_tlog_page
 from logs.report.verdict_sections import make_verdict_rows
 from logs.report.verdicts import judge_flight, read_flown_config
-from uavctl.cli.common import (
-    Column,
-    Common,
-    Flight,
-    Json,
-    System,
-    WideTable,
-    check_readable,
-    make_headline_text,
-    make_pair_table,
-    make_progress,
-    make_table,
-    warn,
-)
+from uavctl.cli.common import Common, Flight, Json, System, check_readable, make_progress
 from uavctl.cli.flight_risk import Rehearsals, compute_flight_risk
+from uavctl.cli.output import Column, WideTable, make_headline_text, make_pair_table, make_table, warn
 from uavctl.errors import DesignError, UsageError
 
 

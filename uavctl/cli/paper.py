@@ -16,16 +16,8 @@ from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from uavctl.cli.common import (
-    SEED,
-    WORKERS,
-    Common,
-    QuietJson,
-    locate_design_errors,
-    make_message_console,
-    make_progress,
-    make_table,
-)
+from uavctl.cli.common import SEED, WORKERS, Common, QuietJson, locate_design_errors, make_progress
+from uavctl.cli.output import make_message_console, make_table
 from uavctl.errors import UsageError
 from uavctl.lab.paper.claims import (
     PRESET,

@@ -12,7 +12,8 @@ from cyclopts import Parameter
 
 from logs.recording.summary import count
 from logs.recording.tlog import TlogPacket, replay_tlog
-from uavctl.cli.common import DEFAULTS, Common, Flight, System, locate_design_errors, warn
+from uavctl.cli.common import DEFAULTS, Common, Flight, System, locate_design_errors
+from uavctl.cli.output import warn
 from uavctl.cli.replay_table import make_foreign_table, make_replay_table
 from uavctl.cli.replays import ReplayOutcome, read_foreign_vehicle, replay_flight
 from uavctl.errors import UsageError

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from logs.recording.replay import Chosen, Context, FieldDivergence, ReplayDifference
 from logs.recording.tlog import ForeignReplay
-from uavctl.cli.common import format_counts, make_pair_table, make_table
+from uavctl.cli.output import format_counts, make_pair_table, make_table
 from uavctl.cli.replays import ReplayOutcome
 
 MAX_FIELDS = 12

@@ -18,7 +18,8 @@ from logs.recording.senders import choose_vehicle
 from logs.recording.tlog import TlogPacket
 from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
 from uavctl.cli import restart_process
-from uavctl.cli.common import locate_design_errors, warn
+from uavctl.cli.common import locate_design_errors
+from uavctl.cli.output import warn
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse_recorded
 from uavctl.errors import DesignError, RecordingError, UsageError

@@ -11,8 +11,8 @@ from pathlib import Path
 from rich.text import Text
 
 from logs.recording.recorder import RecorderStatus
-from uavctl.cli.common import label_text, print_message
 from uavctl.cli.health_lines import choose_line_writer
+from uavctl.cli.output import label_text, print_message
 from uavctl.config import Config
 from uavctl.daemon.control_socket import ControlServer, make_daemon_name
 from uavctl.daemon.daemon import AfterTick

@@ -13,7 +13,8 @@ from cyclopts import Parameter, validators
 from sim.faults import find_fault_problems
 from sim.fleet import make_fleet
 from sim.server import Ready, VehicleSetup, serve_all
-from uavctl.cli.common import DEFAULTS, Common, locate_design_errors, make_message_console, write_document
+from uavctl.cli.common import DEFAULTS, Common, locate_design_errors
+from uavctl.cli.output import make_message_console, write_document
 from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.cli.sim_view import show_view

@@ -13,8 +13,8 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 
 from sim.simulation import VehicleSnapshot
-from uavctl.cli.common import Column, WideTable
 from uavctl.cli.flying import report_dead_view
+from uavctl.cli.output import Column, WideTable
 from uavctl.config import Config
 from uavctl.config.checks import get_position_limits_m
 from uavctl.records import Vec3

@@ -20,13 +20,11 @@ from uavctl.cli.common import (
     Overrides,
     TakeOff,
     check_readable,
-    label_text,
     locate_design_errors,
     make_key_overrides,
-    make_table,
-    print_message,
 )
 from uavctl.cli.flying import check_take_off
+from uavctl.cli.output import label_text, make_table, print_message
 from uavctl.cli.tune_run import TuneRequest, TuneResult, run_tuning
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.document import DataFileError, read_text

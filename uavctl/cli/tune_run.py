@@ -20,8 +20,8 @@ from logs.recording.flight import FlightData
 from logs.recording.output_files import write_atomically
 from logs.recording.reader import explain_missing_end, read
 from uavctl.cause import Cause
-from uavctl.cli.common import print_message, warn
 from uavctl.cli.identify import find_design_warnings, show_fit_progress
+from uavctl.cli.output import print_message, warn
 from uavctl.cli.tune_flights import TuneEnd, TuneFlight, find_complete_flight, fly_once, measure_position
 from uavctl.config import Config
 from uavctl.config.document import DataFileError, read_text

@@ -15,8 +15,6 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
-from uavctl.config.load import find_keys
-
 MAX_SUGGESTED = 3
 SET = "--set"
 
@@ -158,6 +156,8 @@ def _find_settings(name: str, value: str, error: CycloptsError) -> list[str]:
     """Return `--set KEY=VALUE` for each configuration key with this name, if the command takes them."""
     if SET not in _list_options(error):
         return []
+    from uavctl.config.load import find_keys  # loads numpy, which help does not need
+
     value_text = value or "VALUE"
     return [f"{SET} {shlex.quote(f'{key}={value_text}')}" for key in find_keys(name)]
 

@@ -29,8 +29,9 @@ from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER
 from logs.recording.views import ViewBuilder
 from uavctl.arrays import Array
-from uavctl.cli.common import SEED, Common, Flight, Json, make_progress, make_table, warn
+from uavctl.cli.common import SEED, Common, Flight, Json, make_progress
 from uavctl.cli.flying import conclude_flight
+from uavctl.cli.output import make_table, warn
 from uavctl.cli.replays import (
     check_first_file,
     find_other_versions,
