@@ -215,11 +215,11 @@ def encode(record: Record) -> bytes:
     try:
         if isinstance(record, Plan):
             record = round_plan(record)
-        if not _is_non_finite(record):
-            data = _ENCODER.encode(record)
-            # msgspec writes every non-finite float as null: without one, all is said.
-            if b"null" not in data or not _may_be_non_finite(record):
-                return data
+        record = _spell_float_fields(record)
+        data = _ENCODER.encode(record)
+        # msgspec writes every non-finite float as null: without one, all is said.
+        if b"null" not in data or not _may_be_non_finite(record):
+            return data
         return _ENCODER.encode({field: _spell_field(getattr(record, field)) for field in record.__struct_fields__})
     except (TypeError, ValueError, NotImplementedError, OverflowError, RecursionError) as error:
         raise EncodingError(f"{type(record).__name__}: {error}") from error
@@ -233,12 +233,11 @@ def round_plan(plan: Plan) -> Plan:
     """
     if plan.exact_crc32 is not None:
         return plan
-    crc32, rounded = 0, {}
-    for name in MATRICES:
-        matrix: Array = getattr(plan, name)
-        crc32 = zlib.crc32(matrix.tobytes(), crc32)
-        rounded[name] = _round(matrix)
-    return msgspec.structs.replace(plan, exact_crc32=crc32, **rounded)
+    matrices: list[Array] = [getattr(plan, name) for name in MATRICES]
+    values = np.concatenate([matrix.ravel() for matrix in matrices])
+    parts = np.split(_round(values), np.cumsum([matrix.size for matrix in matrices])[:-1])
+    rounded = {name: part.reshape(matrix.shape) for name, part, matrix in zip(MATRICES, parts, matrices, strict=True)}
+    return msgspec.structs.replace(plan, exact_crc32=zlib.crc32(values.tobytes()), **rounded)
 
 
 def _round(values: Array) -> Array:
@@ -340,10 +339,13 @@ def _get_exact_bytes(value: object) -> bytes | None:
         return None
 
 
-def _is_non_finite(record: Record) -> bool:
-    """Return whether a field of type float is not finite, as the gap of most plans is."""
-    values = [getattr(record, name) for name in _list_float_fields(type(record))]
-    return any(type(value) is float and not math.isfinite(value) for value in values)
+def _spell_float_fields(record: Record) -> Record:
+    """Return a record whose fields of type float are texts where they are not finite, as the gap of most plans is."""
+    values = {name: getattr(record, name) for name in _list_float_fields(type(record))}
+    spelled = {
+        name: _spell_tree(value) for name, value in values.items() if type(value) is float and not math.isfinite(value)
+    }
+    return msgspec.structs.replace(record, **spelled) if spelled else record
 
 
 @cache
