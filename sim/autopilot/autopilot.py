@@ -112,6 +112,14 @@ class Autopilot:
             profile, self.pilot, self.parameters, self.estimator, vehicle.battery, can_clear=config.sim.checks.clears
         )
         self._checks = PreflightChecks(config.sim.checks, seed, start_ns)
+        self._acting_parts = (
+            self.telemetry,
+            self.pilot,
+            self.estimator,
+            self._failsafes,
+            self.inertial,
+            self._checks,
+        )
         self._was_armed = airborne
         self.last_text = ""
         self.setpoint_source: tuple[int, int] | None = None
@@ -149,8 +157,7 @@ class Autopilot:
         """Time at which it next acts by itself [ns]; None after a crash."""
         if self.pilot.crash_reason:
             return None
-        parts = self.telemetry, self.pilot, self.estimator, self._failsafes, self.inertial, self._checks
-        return find_earliest_ns([part.next_ns for part in parts])
+        return find_earliest_ns([part.next_ns for part in self._acting_parts])
 
     def run(self, at_ns: int) -> tuple[bytes, ...]:
         """Act on everything due at `at_ns`, with the vehicle moved there; return the datagrams sent."""

@@ -133,14 +133,14 @@ class Pilot:
     @property
     def _is_checking_height(self) -> bool:
         """Whether floor or height are watched; the linear plant may fly through the floor."""
-        phases = (
-            (Phase.CLIMB, Phase.DESCENT) if self._linear_plant is not None else (Phase.CLIMB, Phase.DESCENT, Phase.AIR)
-        )
-        return self.phase in phases and self._vehicle.has_down
+        phase = self.phase
+        is_above_floor = phase is Phase.CLIMB or phase is Phase.DESCENT
+        return (is_above_floor or (phase is Phase.AIR and self._linear_plant is None)) and self._vehicle.has_down
 
     def run(self, at_ns: int) -> None:
         """Act on everything due at `at_ns`, with the vehicle moved there."""
-        if self._deadline_ns is not None and self._deadline_ns <= at_ns:
+        deadline_ns = self._deadline_ns
+        if deadline_ns is not None and deadline_ns <= at_ns:
             self._handle_setpoint_timeout(at_ns)
         if self._liftoff_ns is not None and self._liftoff_ns <= at_ns:
             self._leave_floor(at_ns)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from sim.vehicle.airframe import GRAVITY_MPS2, Airframe
 from sim.vehicle.rigid_body import BodyState, Quaternion
@@ -20,8 +20,7 @@ MAX_YAW_RATE_RPS = math.radians(90.0)
 MIN_UP_MPS2 = 1.0  # smallest upward thrust of a setpoint: keeps its attitude defined
 
 
-@dataclass(frozen=True)
-class AttitudeSetpoint:
+class AttitudeSetpoint(NamedTuple):
     """Thrust per mass, and the attitude that points it."""
 
     force_mps2: Vec3  # specific force wanted of the rotors, NED

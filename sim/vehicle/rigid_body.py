@@ -88,9 +88,10 @@ def compute_acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrenc
     coefficients.
     """
     w, x, y, z = attitude
-    r11, r12, r13 = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
-    r21, r22, r23 = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
-    r31, r32, r33 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
+    r11, r12, r13 = 1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)
+    r21, r22, r23 = 2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)
+    r31, r32, r33 = 2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)
     north, east, down = velocity[0] - wind[0], velocity[1] - wind[1], velocity[2] - wind[2]
     u = r11 * north + r21 * east + r31 * down
     v = r12 * north + r22 * east + r32 * down
@@ -132,7 +133,9 @@ def _compute_rotation_vector_rate(angle: Vec3, rates: Vec3) -> Vec3:
 
 
 def _add_scaled(start: Vec3, slope: Vec3, h: float) -> Vec3:
-    return start[0] + h * slope[0], start[1] + h * slope[1], start[2] + h * slope[2]
+    x, y, z = start
+    u, v, w = slope
+    return x + h * u, y + h * v, z + h * w
 
 
 def _average_slopes(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:

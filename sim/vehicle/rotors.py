@@ -40,18 +40,11 @@ class Rotors:
 
     def compute_wrench(self, speeds_rps: RotorValues) -> Wrench:
         """Return force and torque of rotors at these speeds."""
-        k = self._thrust_n_s2
+        k, lever_m = self._thrust_n_s2, self._lever_m
         a, b, c, d = speeds_rps
         f1, f2, f3, f4 = k * a * a, k * b * b, k * c * c, k * d * d
-        return Wrench(
-            f1 + f2 + f3 + f4,
-            (
-                self._lever_m * (f3 + f4 - f1 - f2),
-                self._lever_m * (f1 + f4 - f2 - f3),
-                self._torque_m * (f1 + f3 - f2 - f4),
-            ),
-            a + b + c + d,
-        )
+        torque_nm = lever_m * (f3 + f4 - f1 - f2), lever_m * (f1 + f4 - f2 - f3), self._torque_m * (f1 + f3 - f2 - f4)
+        return Wrench(f1 + f2 + f3 + f4, torque_nm, a + b + c + d)
 
     def step(self) -> tuple[Wrench, Wrench, Wrench]:
         """Move on by one step, exactly; return the wrenches at its start, middle and end."""
