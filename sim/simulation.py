@@ -108,6 +108,9 @@ class Peers:
     def advance(self, to_ns: int) -> list[Due]:
         """Move time on; return the datagrams due up to and including `to_ns`, in order of time."""
         self._run_events(to_ns)
+        return self._take_due(to_ns)
+
+    def _take_due(self, to_ns: int) -> list[Due]:
         due = [*self._outbox, *((at_ns, self._mocap_link, data) for at_ns, data in self.channel.pop_due(to_ns))]
         self._outbox.clear()
         due.sort(key=lambda datagram: datagram[0])  # stable: the vehicle first
@@ -119,8 +122,8 @@ class Peers:
         Time stops only at events of the peers: more stops would change the rounding of their motion.
         """
         while True:
-            at_ns = max(min(to_ns, self._next_action_ns), self.now_ns)
-            for arrival_ns, link, data in self.advance(at_ns):
+            at_ns = self._run_next_events(to_ns)
+            for arrival_ns, link, data in self._take_due(at_ns):
                 for answer in handle(link, data, arrival_ns).answers:
                     self.receive(answer.link, answer.data, at_ns)
             if at_ns >= to_ns:
@@ -183,28 +186,36 @@ class Peers:
             self._report_truth()
 
     def _run_events(self, to_ns: int) -> None:
-        while True:
-            autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
-            at_ns = max(min(self._find_next_action_ns(autopilot_ns, fault_ns), to_ns), self.now_ns)
-            self._advance_vehicle(at_ns)
+        while self._run_next_events(to_ns) < to_ns:
+            pass
+
+    def _run_next_events(self, to_ns: int) -> int:
+        """Move time on to the next event, at most to `to_ns`, and act on all that is due then; return that time."""
+        autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
+        stop_ns = max(min(self._find_next_action_ns(autopilot_ns, fault_ns), to_ns), self.now_ns)
+        self._advance_vehicle(stop_ns)
+        has_acted = True
+        while has_acted:
             has_acted = False
-            if fault_ns is not None and fault_ns <= at_ns:
-                self._faults.run(at_ns)
+            if fault_ns is not None and fault_ns <= stop_ns:
+                self._faults.run(stop_ns)
                 has_acted = True
-            if autopilot_ns is not None and autopilot_ns <= at_ns:
-                self._outbox.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
+            if autopilot_ns is not None and autopilot_ns <= stop_ns:
+                self._outbox.extend((stop_ns, VEHICLE, data) for data in self.autopilot.run(stop_ns))
                 has_acted = True
-            if self.cameras.next_ns <= at_ns:
-                vehicle = self.vehicle
-                sample = self.cameras.capture(vehicle.position_m, vehicle.velocity_mps, vehicle.attitude)
-                if sample is None:
-                    self.channel.skip_packet(at_ns)
-                else:  # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
-                    self.channel.push(*sample, is_certain=self._airborne and not self.channel.counters.sent)
+            if self.cameras.next_ns <= stop_ns:
+                self._capture_position(stop_ns)
                 has_acted = True
-            if not has_acted:
-                break
-        self._advance_vehicle(to_ns)
+            autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
+        return stop_ns
+
+    def _capture_position(self, at_ns: int) -> None:
+        vehicle = self.vehicle
+        sample = self.cameras.capture(vehicle.position_m, vehicle.velocity_mps, vehicle.attitude)
+        if sample is None:
+            self.channel.skip_packet(at_ns)
+        else:  # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
+            self.channel.push(*sample, is_certain=self._airborne and not self.channel.counters.sent)
 
     def _advance_vehicle(self, to_ns: int) -> None:
         while self._truth_ns < to_ns:

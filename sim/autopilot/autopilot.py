@@ -112,14 +112,7 @@ class Autopilot:
             profile, self.pilot, self.parameters, self.estimator, vehicle.battery, can_clear=config.sim.checks.clears
         )
         self._checks = PreflightChecks(config.sim.checks, seed, start_ns)
-        self._acting_parts = (
-            self.telemetry,
-            self.pilot,
-            self.estimator,
-            self._failsafes,
-            self.inertial,
-            self._checks,
-        )
+        self._acting_parts = (self.telemetry, self.pilot, self.estimator, self._failsafes, self.inertial, self._checks)
         self._was_armed = airborne
         self.last_text = ""
         self.setpoint_source: tuple[int, int] | None = None

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 MAX_BACKSTEP_MS = 1000  # a clock that goes back by more is another one; reordering on a link is less
 MAX_ADVANCE_MS = 30_000  # more than our clock: late messages, and fast simulated clocks
@@ -16,8 +16,7 @@ CONFIRM_NS = 5_000_000_000  # time limit for the second message of another clock
 _WRAP_MS = 2**32
 
 
-@dataclass(frozen=True)
-class _Reading:
+class _Reading(NamedTuple):
     """Time since boot [ms] and its arrival [ns]; a consistent message after it confirms it."""
 
     boot_ms: int
@@ -50,9 +49,9 @@ class BootClock:
             boot_ms: its time since boot, modulo 2**32 ms.
         """
         known, candidate = self._readings.get(kind), self._candidates.get(kind)
-        reading = _Reading(boot_ms, at_ns)
+        reading = _Reading(boot_ms, at_ns, is_confirmed=known is not None)
         if known is None or _is_same_clock(known, reading):
-            self._accept(kind, _Reading(boot_ms, at_ns, is_confirmed=known is not None))
+            self._accept(kind, reading)
         elif candidate is not None and at_ns - candidate.at_ns <= CONFIRM_NS and _is_same_clock(candidate, reading):
             del self._candidates[kind]
             has_restarted = known.is_confirmed and (
@@ -61,7 +60,7 @@ class BootClock:
             if has_restarted:  # readings of other kinds are older than the restart
                 self._readings.clear()
                 self._candidates.clear()
-            self._accept(kind, _Reading(boot_ms, at_ns, is_confirmed=True))
+            self._accept(kind, reading)
             return has_restarted
         else:
             self._candidates[kind] = reading

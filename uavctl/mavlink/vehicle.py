@@ -291,20 +291,26 @@ class VehicleMonitor:
         if not self._wants_inertial:
             return
         kind = "quaternion" if message.quaternion else "angles"
-        if self._sensor_streams.setdefault(kind, SensorStreamMonitor()).is_current(
-            message.stamp_us, message.angles_rad, at_ns
-        ):
+        if self._find_stream(kind).is_current(message.stamp_us, message.angles_rad, at_ns):
             self._attitude = message.angles_rad, at_ns
         else:
             self._count_bad(EventCode.INERTIAL_STALE)
+
+    def _find_stream(self, kind: str) -> SensorStreamMonitor:
+        """Return the monitor of a kind of message; one is made for the first message."""
+        stream = self._sensor_streams.get(kind)
+        if stream is None:
+            stream = self._sensor_streams[kind] = SensorStreamMonitor()
+        return stream
 
     def _make_inertial_sample(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
         """Make a sample from a specific force and the newest attitude; nothing if either is old or unknown."""
         if not self._wants_inertial:
             return ()
         kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
-        stream = self._sensor_streams.setdefault(kind, SensorStreamMonitor())
-        is_new = stream.is_current(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
+        is_new = self._find_stream(kind).is_current(
+            message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us
+        )
         self.inertial_total += is_new is not None
         if not is_new:
             self._count_bad(EventCode.INERTIAL_STALE)
