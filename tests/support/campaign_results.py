@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from uavctl.lab.campaign.results import SCHEMA
+
 STEPS = 50
-_COUNTS = ("state_violations", "input_violations", "saturated", "decisions", "infeasible", "slack_used", "fallbacks")
-_LISTS = dict.fromkeys(("ages", "outside"), pa.list_(pa.int64()))
-_TYPES = {"error": pa.string(), **_LISTS, "cell": pa.int32(), "run": pa.int64()}
+_EMPTY = {name: float("nan") if SCHEMA.field(name).type == pa.float64() else 0 for name in SCHEMA.names}
 
 
 def cell(index: int, controller: str, kind: str = "lqg", link: str = "30 %", **fields: Any) -> dict[str, Any]:
@@ -29,10 +29,10 @@ def runs(index: int, cost: Sequence[float], **columns: Sequence[Any]) -> list[di
     rows = []
     for run, value in enumerate(cost):
         failed = bool(np.isnan(value))
-        row: dict[str, Any] = {"cell": index, "run": run, "error": "it broke" if failed else "", "cost": float(value)}
-        row |= {"settled_cost": value / STEPS, "mean_square_input": 1.0, "largest_gap": float("nan")}
-        row |= dict.fromkeys(_COUNTS, 0) | {"ages": [] if failed else [STEPS - 1, 1]}
-        rows.append(row | {name: values[run] for name, values in columns.items()})
+        row: dict[str, Any] = {**_EMPTY, "cell": index, "run": run, "error": "it broke" if failed else ""}
+        row |= {"cost": float(value), "settled_cost": value / STEPS, "mean_square_input": 1.0}
+        row |= {"ages": [] if failed else [STEPS - 1, 1]} | {name: values[run] for name, values in columns.items()}
+        rows.append({**row, "outside": row["outside"] or [1] * row["state_violations"]})
     return rows
 
 
@@ -42,6 +42,14 @@ def write(folder: Path, cells: Sequence[Mapping[str, Any]], rows: Sequence[Mappi
     count = max((row["run"] for row in rows), default=0) + 1
     document = {"version": 1, "name": "by hand", "uavctl_version": "9.9", "master": 7, "runs": count, "steps": STEPS}
     (folder / "campaign.json").write_bytes(msgspec.json.encode({**document, "cells": list(cells)}))
-    fields = [(name, _TYPES.get(name, pa.float64())) for name in (rows or runs(0, [1.0]))[0]]
-    pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=pa.schema(fields)), folder / "runs.parquet")
+    (folder / "runs.parquet").mkdir(exist_ok=True)
+    for index in dict.fromkeys(row["cell"] for row in rows):
+        put(folder, index, pa.Table.from_pylist([dict(row) for row in rows if row["cell"] == index], schema=SCHEMA))
     return folder
+
+
+def put(folder: Path, index: int, table: pa.Table, first: int = 0) -> Path:
+    """Write a file of the table of runs, of runs from `first` on of a cell."""
+    path = folder / "runs.parquet" / f"{index:05d}-{first:08d}.parquet"
+    pq.write_table(table, path)
+    return path

@@ -24,9 +24,9 @@ from uavctl.cli.signals import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
-from uavctl.lab.campaign.results import CellSummary, summarise
+from uavctl.lab.campaign.results import SCHEMA, CellSummary, summarise
 from uavctl.lab.campaign.spec import read_campaign
-from uavctl.lab.campaign.store import SCHEMA, Store
+from uavctl.lab.campaign.store import Store
 from uavctl.lab.campaign.tasks import make_cells, make_document, make_tasks
 from uavctl.lab.campaign.trial_page import write_trial_report
 from uavctl.lab.campaign.trials import SCHEMA as TRIAL_SCHEMA
@@ -118,15 +118,14 @@ def fly_campaign(
             workers_context = (
                 open_processes(workers or len(os.sched_getaffinity(0))) if dask is None else open_cluster(dask)
             )
-            if not store.is_complete() and not _fly_tasks(store, tasks, workers_context):
+            if not _fly_tasks(store, tasks, workers_context):
                 raise KeyboardInterrupt
-            runs_file = store.finish(tasks)
             print_message("writing the page")
             report = campaign.write(store.folder)
     except KeyboardInterrupt:
         print_message(_describe_interruption(store, spec, runs))
         return INTERRUPTED
-    return campaign.conclude(store, runs_file, report, time.perf_counter() - begin_s, json)
+    return campaign.conclude(store, report, time.perf_counter() - begin_s, json)
 
 
 @dataclass(frozen=True)
@@ -142,11 +141,11 @@ class _PreparedCampaign(Generic[S]):
     summarise: Callable[[Path], list[S]]  # computes the figures of the cells in a folder
     render: Callable[[CampaignResult[S]], RenderableType]
 
-    def conclude(self, store: Store, runs_file: Path, report: Path, wall_s: float, json: bool) -> int:
+    def conclude(self, store: Store, report: Path, wall_s: float, json: bool) -> int:
         """Show the result; return the exit code."""
         result = CampaignResult(
             name=self.name,
-            runs_file=str(runs_file),
+            runs_file=str(store.table),
             report=str(report),
             wall_s=wall_s,
             cells=self.summarise(store.folder),

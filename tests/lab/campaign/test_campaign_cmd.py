@@ -61,11 +61,11 @@ def scheduler() -> Iterator[str]:
         yield str(cluster.scheduler_address)
 
 
-def contents(folder: Path) -> bytes:
+def contents(folder: Path) -> dict[str, bytes]:
     assert sorted(path.name for path in folder.iterdir()) == [
         ".lock", "campaign.json", "campaign.toml", "report.html", "runs.parquet"
     ]  # fmt: skip
-    return (folder / "runs.parquet").read_bytes()
+    return {path.name: path.read_bytes() for path in sorted((folder / "runs.parquet").iterdir())}
 
 
 HELD = """
@@ -135,11 +135,10 @@ def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, 
     process = started(spec, folder, workers=1)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate(timeout=LIMIT_S)
-    part_times = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")}
+    part_times = {path: path.stat().st_mtime_ns for path in folder.glob("runs.parquet/*.parquet")}
     assert process.returncode == -signal.SIGKILL and len(part_times) == 1
-    assert not (folder / "runs.parquet").exists()
     assert run(["campaign", str(spec), "--out", str(folder)]) == 2  # not without --resume
-    assert {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")} == part_times
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("runs.parquet/*.parquet")} == part_times
     assert run(["campaign", str(spec), "--workers", "1", "--out", str(folder), "--resume"]) == 0
     assert contents(folder) == contents(flown)
 
@@ -152,7 +151,7 @@ def test_ctrl_c_ends_it_and_names_the_command_to_continue(spec: Path, tmp_path: 
     _, text = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 130 and "interrupted" in text and "Traceback" not in text
     assert text.strip().splitlines()[-1] == f"uavctl campaign {spec} --out {folder} --resume"
-    assert list(folder.glob("parts/*.parquet")) and not (folder / "runs.parquet").exists()
+    assert list(folder.glob("runs.parquet/*.parquet")) and not (folder / "report.html").exists()
 
 
 def test_ctrl_c_before_the_first_run_leaves_no_campaign(

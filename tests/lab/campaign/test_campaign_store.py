@@ -1,4 +1,4 @@
-"""The folder of a campaign: parts, the table in the end, and what may go on there."""
+"""The folder of a campaign: the files of its table, and what may go on there."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import pytest
 from campaign_rig import cells, controller, table
 
 from uavctl.errors import UavctlError, UsageError
+from uavctl.lab.campaign.results import SCHEMA
 from uavctl.lab.campaign.spec import CHUNK
-from uavctl.lab.campaign.store import SCHEMA, Store, find_first_difference, make_table
+from uavctl.lab.campaign.store import Store, find_first_difference, make_table
 from uavctl.lab.campaign.tasks import Task, fly_task, make_tasks
 
 TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
@@ -25,17 +26,16 @@ def tasks(tmp_path: Path) -> list[Task]:
 
 
 def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, tasks: list[Task]) -> None:
-    files = []
+    written = []
     for name, order in (("one", tasks), ("other", tasks[::-1])):
         store = Store(tmp_path / name)
         with store.open(DOCUMENT, "text", resume=False):
             for task in order:
                 store.keep(task, task.fly())
-            assert store.find_finished(tasks) == {task.name for task in tasks} and not store.is_complete()
-            files.append(store.finish(tasks))
-        assert store.is_complete() and not (tmp_path / name / "parts").exists()
-    assert files[0].read_bytes() == files[1].read_bytes()
-    figures = pq.read_table(files[0])
+            assert store.find_finished(tasks) == {task.name for task in tasks}
+        written.append({path.name: path.read_bytes() for path in store.table.iterdir()})
+    assert written[0] == written[1] and len(written[0]) == len(tasks)
+    figures = pq.read_table(tmp_path / "one" / "runs.parquet")
     assert figures.schema.names == ["cell", "controller", "link", *SCHEMA.names[1:]]
     assert set(zip(*(figures[name].to_pylist() for name in ("cell", "controller", "link")), strict=True)) == {
         (0, "lqg", "a"), (1, "lqg", "b"),
@@ -53,17 +53,6 @@ def test_rows_without_figures_are_kept(tasks: list[Task]) -> None:
     rows = make_table(tasks[1].make_lost_rows("it died")).to_pylist()
     assert len(rows) == 4 and rows[0]["error"] == "it died" and rows[0]["ages"] == []
     assert np.isnan(rows[0]["cost"]) and rows[0]["steps"] == 0
-
-
-def test_a_part_that_is_damaged_is_named(tmp_path: Path, tasks: list[Task]) -> None:
-    store = Store(tmp_path / "one")
-    with store.open(DOCUMENT, "text", resume=False):
-        for task in tasks:
-            store.keep(task, task.fly())
-        part = tmp_path / "one" / "parts" / f"{tasks[1].name}.parquet"
-        part.write_bytes(part.read_bytes()[:-20])
-        with pytest.raises(UavctlError, match=rf"{tasks[1].name}\.parquet is damaged.*remove it"):
-            store.finish(tasks)
 
 
 def test_only_the_same_campaign_continues_and_only_with_resume(tmp_path: Path) -> None:

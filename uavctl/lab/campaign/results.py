@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from logs.recording.budget import ExcessError, read_whole
+from logs.recording.budget import read_whole
 from logs.report.run_statistics import (
     Interval,
     PairedDifference,
@@ -30,11 +30,37 @@ from uavctl.errors import RecordingError, UavctlError
 DOCUMENT, RUNS = "campaign.json", "runs.parquet"
 
 
-_COUNT_COLUMNS = ("saturated", "decisions", "infeasible", "slack_used", "fallbacks")
-_FLOAT_COLUMNS = ("cost", "settled_cost", "mean_square_input", "largest_gap")
-_FIGURE_COLUMNS = (*_FLOAT_COLUMNS, "state_violations", "input_violations", *_COUNT_COLUMNS)
-_LATER_COLUMNS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")  # tables of older versions lack them
-_RUN_COLUMNS = ("run", "error", *_FIGURE_COLUMNS, *_LATER_COLUMNS, "ages", "outside")
+_I32, _I64, _F64 = pa.int32(), pa.int64(), pa.float64()
+# Columns of a run in the linear world; histograms are lists.
+SCHEMA = pa.schema(
+    [
+        ("cell", _I32),
+        ("run", _I64),
+        ("error", pa.string()),
+        ("cost", _F64),
+        ("settled_cost", _F64),
+        ("steps", _I32),
+        ("state_violations", _I32),
+        ("input_violations", _I32),
+        ("saturated", _I32),
+        ("mean_square_input", _F64),
+        ("decisions", _I32),
+        ("infeasible", _I32),
+        ("slack_used", _I32),
+        ("fallbacks", _I32),
+        ("max_age", _I32),
+        ("age_sum", _I64),
+        ("ages", pa.list_(_I64)),
+        ("outside", pa.list_(_I64)),
+        ("largest_gap", _F64),
+        ("near_s", _F64),
+        ("nearer_s", _F64),
+        ("hold_rms_m", _F64),
+        ("beyond_m", _F64),
+    ]
+)
+_FIGURES = [name for name in SCHEMA.names if name not in ("cell", "run", "error", "ages", "outside")]
+_COUNTS = ("saturated", "decisions", "infeasible", "slack_used", "fallbacks")
 
 
 class CellRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,10 +77,9 @@ class CellRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 # Of `campaign.json`: ten thousand cells have some three million bytes.
 _MAX_DOCUMENT_BYTES = 2**26
-# Of the table: a run has its own cost, which packs to no less than two bytes, and a figure has eight in memory.
-_FREE_ROWS, _MIN_ROW_BYTES, _VALUE_BYTES = 2**20, 2, 8
-# Of memory for the rows of one cell: what may unpack to it however short the file is, and for each byte of the file.
+# Of memory for the rows of one cell: what may unpack to it however short its files are, and for each byte of them.
 _FREE_CELL_BYTES, _MAX_CELL_RATIO = 2**30, 64
+_VALUE_BYTES = 8  # of a figure in memory
 
 D = TypeVar("D")
 F = TypeVar("F")
@@ -89,8 +114,7 @@ class CampaignRuns:
     index: NDArray[np.int64]  # indices of the runs (N,)
     figures: dict[str, Array]  # A value for each of them (N,), by column of the results
     ages: NDArray[np.int64]  # number of steps at each age, over all of them
-    # Runs with a state outside in each step 1, 2 …, up to the last one with any; tables of older versions have none
-    outside: NDArray[np.int64]
+    outside: NDArray[np.int64]  # runs with a state outside in each step 1, 2 …, up to the last one with any
     failed: tuple[tuple[int, str], ...]  # (run, error) of the others
 
     def __getitem__(self, column: str) -> Array:
@@ -121,9 +145,7 @@ def read_results(folder: Path) -> Results:
     record = read_document(folder, CampaignRecord)
     runs = {
         cell.index: cell_runs
-        for cell, cell_runs in zip(
-            record.cells, read_cells(folder, record.cells, _RUN_COLUMNS, _collect_runs), strict=True
-        )
+        for cell, cell_runs in zip(record.cells, read_cells(folder, record.cells, SCHEMA, _collect_runs), strict=True)
     }
     return Results(
         folder=folder,
@@ -149,69 +171,49 @@ def read_document(folder: Path, kind: type[D]) -> D:
         raise UavctlError(f"{folder} holds no campaign ({error}); give the folder of one") from error
 
 
-def read_cells(
-    folder: Path, cells: Sequence[C], columns: Sequence[str], figures: Callable[[pa.Table, C], F]
-) -> list[F]:
+def read_cells(folder: Path, cells: Sequence[C], schema: pa.Schema, figures: Callable[[pa.Table, C], F]) -> list[F]:
     """Return the result of `figures` for the rows of each cell in `runs.parquet`; those of one cell are in memory.
 
-    Raises:
-        UavctlError: It is missing or damaged, or unpacks to far more than its bytes.
-    """
-    path, by_index = folder / RUNS, {cell.index: cell for cell in cells}
-    found: dict[int, F] = {}
-    try:
-        with pq.ParquetFile(path, read_dictionary=["error"]) as file:
-            for index, rows in _iterate_cells(file, ("cell", *columns), path.stat().st_size):
-                if index in by_index:
-                    found[index] = figures(rows, by_index[index])
-            empty = file.schema_arrow.empty_table()
-        return [found[cell.index] if cell.index in found else figures(empty, cell) for cell in cells]
-    except ExcessError as error:
-        raise UavctlError(f"{path}: {error}, as no campaign does; fly it again, or fetch the file again") from error
-    except KeyError as error:
-        raise UavctlError(f"{path}: lacks a column ({error.args[0]!s}); give the folder of a campaign") from error
-    except (OSError, pa.ArrowException, ValueError, TypeError, MemoryError) as error:
-        raise UavctlError(
-            f"{path}: cannot be read ({error}); if the campaign was interrupted, go on with --resume"
-        ) from error
-
-
-def _iterate_cells(file: pq.ParquetFile, columns: Sequence[str], file_bytes: int) -> Iterator[tuple[int, pa.Table]]:
-    """Yield each cell's index and rows, in the order of the file.
+    Args:
+        schema: Columns to read.
 
     Raises:
-        ValueError: It is not in the order of its cells.
-        ExcessError: It holds far more than its bytes.
+        UavctlError: A file is missing or damaged, or unpacks to far more than its bytes.
     """
-    max_rows = _FREE_ROWS + file_bytes // _MIN_ROW_BYTES
-    if file.metadata.num_rows > max_rows:
-        raise ExcessError(f"claims {file.metadata.num_rows} runs in {file_bytes} bytes")
-    left_bytes = _FREE_CELL_BYTES + _MAX_CELL_RATIO * file_bytes
-    last, kept_bytes = -1, 0
-    parts: list[pa.Table] = []
-    for group in range(file.num_row_groups):
-        kept_bytes += _count_memory(file.metadata.row_group(group), columns)
-        if kept_bytes > left_bytes:
-            raise ExcessError(f"row group {group} makes one cell unpack to more than {left_bytes} bytes")
-        rows = file.read_row_group(group, columns=list(columns))
-        cells = rows["cell"].to_numpy()
-        if rows.num_rows and not (cells[0] >= last and bool((np.diff(cells) >= 0).all())):
-            raise ValueError(f"row group {group} is not in the order of the cells")
-        starts = np.searchsorted(cells, np.unique(cells))
-        for begin, end in zip(starts, (*starts[1:], rows.num_rows), strict=True):
-            index = int(cells[begin])
-            if index != last and last >= 0:
-                yield last, pa.concat_tables(parts)
-            if index != last:
-                last, parts, kept_bytes = index, [], _count_memory(file.metadata.row_group(group), columns)
-            parts.append(rows.slice(begin, end - begin))
-    if last >= 0:
-        yield last, pa.concat_tables(parts)
+    paths: dict[int, list[Path]] = {}
+    for path in sorted((folder / RUNS).glob("*.parquet")):
+        paths.setdefault(int(path.name.partition("-")[0]), []).append(path)
+    return [figures(_read_rows(paths.get(cell.index, ()), schema), cell) for cell in cells]
 
 
-def _count_memory(group: pq.RowGroupMetaData, columns: Sequence[str]) -> int:
-    """Return the bytes that some columns of a row group unpack to, by its own words."""
-    chunks = [group.column(index) for index in range(group.num_columns)]
+def _read_rows(paths: Sequence[Path], schema: pa.Schema) -> pa.Table:
+    """Read the rows of one cell.
+
+    Raises:
+        UavctlError: See `read_cells`.
+    """
+    tables, left_bytes = [schema.empty_table()], _FREE_CELL_BYTES
+    for path in paths:
+        try:
+            with pq.ParquetFile(path) as file:
+                left_bytes += _MAX_CELL_RATIO * path.stat().st_size - _count_memory(file.metadata, schema.names)
+                if left_bytes < 0:
+                    raise UavctlError(f"{path}: unpacks to more than a campaign's runs do; fly it again")
+                table = file.read(schema.names).select(schema.names).cast(schema)
+                if any(column.null_count for column in table.columns):
+                    raise ValueError("a value is missing")
+                tables.append(table)
+        except KeyError as error:
+            raise UavctlError(f"{path}: lacks a column ({error.args[0]!s}); give the folder of a campaign") from error
+        except (OSError, pa.ArrowException, ValueError, TypeError, MemoryError) as error:
+            raise UavctlError(f"{path} is damaged ({error}); remove it and go on with --resume") from error
+    return pa.concat_tables(tables)
+
+
+def _count_memory(file: pq.FileMetaData, columns: Sequence[str]) -> int:
+    """Return the bytes that some columns of a file unpack to, by its own words."""
+    groups = [file.row_group(index) for index in range(file.num_row_groups)]
+    chunks = [group.column(index) for group in groups for index in range(group.num_columns)]
     return sum(
         _VALUE_BYTES * chunk.num_values + chunk.total_uncompressed_size
         for chunk in chunks
@@ -237,19 +239,11 @@ def _collect_runs(rows: pa.Table, cell: CellFigures) -> CampaignRuns:  # noqa: A
     )
     return CampaignRuns(
         index=run_numbers[is_complete],
-        figures={name: _read_column(rows, name, is_complete) for name in (*_FIGURE_COLUMNS, *_LATER_COLUMNS)},
+        figures={name: np.asarray(rows[name].to_numpy()[is_complete], dtype=np.float64) for name in _FIGURES},
         ages=_sum_histograms(rows["ages"], is_complete),
-        outside=_sum_histograms(rows["outside"], is_complete)
-        if "outside" in rows.column_names
-        else np.zeros(0, dtype=np.int64),
+        outside=_sum_histograms(rows["outside"], is_complete),
         failed=failed,
     )
-
-
-def _read_column(rows: pa.Table, name: str, is_complete: Flags) -> Array:
-    if name in _LATER_COLUMNS and name not in rows.column_names:
-        return np.full(int(is_complete.sum()), np.nan)
-    return np.asarray(rows[name].to_numpy()[is_complete], dtype=np.float64)
 
 
 def _sum_histograms(lists: pa.ChunkedArray, is_complete: Flags) -> NDArray[np.int64]:
@@ -330,15 +324,14 @@ def summarise_cell(results: Results, cell: CellFigures) -> CellSummary:
     inputs, _ = _estimate_rates(runs["input_violations"], results.steps)
     cost, settled = _estimate_mean(runs["cost"]), _estimate_mean(runs["settled_cost"])
     gaps = runs["largest_gap"][np.isfinite(runs["largest_gap"])]
-    has_outside_counts = n > 0 and (runs.outside.sum() > 0 or not runs["state_violations"].any())
-    worst = max_step_rate(runs.outside, n, results.steps) if has_outside_counts else (None, None)
+    worst = max_step_rate(runs.outside, n, results.steps) if n else (None, None)
     settled_outside = runs.outside[results.steps // 2 :]
     (ages,) = np.nonzero(runs.ages)
     summary_fields = CellSummary.__struct_fields__
     shared_fields: dict[str, Any] = {
         name: getattr(cell, name) for name in cell.__struct_fields__ if name in summary_fields
     }
-    shared_fields |= {name: int(runs[name].sum()) for name in _COUNT_COLUMNS}
+    shared_fields |= {name: int(runs[name].sum()) for name in _COUNTS}
     shared_fields |= {name: _compute_finite(np.median, runs[name]) for name in ("near_s", "nearer_s", "hold_rms_m")}
     return CellSummary(
         **shared_fields,
@@ -363,7 +356,7 @@ def summarise_cell(results: Results, cell: CellFigures) -> CellSummary:
         worst_step_rate=worst[0],
         worst_step_ci=worst[1],
         settled_violation_rate=(
-            float(settled_outside.sum() / (n * (results.steps - results.steps // 2))) if has_outside_counts else None
+            float(settled_outside.sum() / (n * (results.steps - results.steps // 2))) if n else None
         ),
     )
 

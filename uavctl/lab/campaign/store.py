@@ -1,6 +1,6 @@
-"""Folder of a campaign: its document, finished tasks as parts, and at the end one table of all runs.
+"""Folder of a campaign: its document, and the table of its runs, a folder of Parquet files with one for each task.
 
-A task is stored completely or not at all, so a killed campaign can continue. The bytes of the table depend on the runs
+A task is stored completely or not at all, so a killed campaign can continue. The bytes of a file depend on its runs
 alone.
 """
 
@@ -10,7 +10,6 @@ import fcntl
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,9 @@ from numpy.typing import NDArray
 from logs.recording.replay import iterate_different_leaves
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.pool import Columns, Work
-from uavctl.lab.campaign.results import DOCUMENT, RUNS, read_document
+from uavctl.lab.campaign.results import DOCUMENT, RUNS, SCHEMA, read_document
 
-SPECIFICATION, PARTS = "campaign.toml", "parts"
-_GROUP_ROWS = 65_536
+SPECIFICATION = "campaign.toml"
 # Columns that name the cell of each row, in either world, so that the table can be read alone.
 CELL_COLUMNS = ("scenario", "autopilot", "rate_hz", "controller", "link", "air", "disturbance", "plant")
 _WRITER: dict[str, Any] = {
@@ -36,43 +34,15 @@ _WRITER: dict[str, Any] = {
     "use_dictionary": ["error", *CELL_COLUMNS],
 }
 
-_I32, _I64, _F64 = pa.int32(), pa.int64(), pa.float64()
-SCHEMA = pa.schema(
-    [
-        ("cell", _I32),
-        ("run", _I64),
-        ("error", pa.string()),
-        ("cost", _F64),
-        ("settled_cost", _F64),
-        ("steps", _I32),
-        ("state_violations", _I32),
-        ("input_violations", _I32),
-        ("saturated", _I32),
-        ("mean_square_input", _F64),
-        ("decisions", _I32),
-        ("infeasible", _I32),
-        ("slack_used", _I32),
-        ("fallbacks", _I32),
-        ("max_age", _I32),
-        ("age_sum", _I64),
-        ("ages", pa.list_(_I64)),
-        ("outside", pa.list_(_I64)),
-        ("largest_gap", _F64),
-        ("near_s", _F64),
-        ("nearer_s", _F64),
-        ("hold_rms_m", _F64),
-        ("beyond_m", _F64),
-    ]
-)
-
 
 class Store:
     """Folder of one campaign."""
 
     def __init__(self, folder: Path, schema: pa.Schema = SCHEMA) -> None:
         self.folder = folder
+        self.table = folder / RUNS
         self._schema = schema
-        self._parts = folder / PARTS
+        self._cells: dict[int, dict[str, Any]] = {}  # the document's record of each cell, by its index
 
     @contextmanager
     def open(self, document: Mapping[str, object], specification: str, resume: bool) -> Iterator[None]:
@@ -92,7 +62,8 @@ class Store:
                 lock = stack.enter_context((self.folder / ".lock").open("ab"))
                 _lock_folder(lock.fileno(), self.folder)
                 self._begin(document, specification, resume)
-                self._parts.mkdir(exist_ok=True)
+                self.table.mkdir(exist_ok=True)
+                self._cells = {cell["index"]: cell for cell in read_document(self.folder, dict[str, Any])["cells"]}
             yield
 
     def has_campaign(self) -> bool:
@@ -110,13 +81,9 @@ class Store:
         if resume and not self.has_campaign():
             raise UsageError(f"{self.folder} holds no campaign that could go on; leave out --resume")
 
-    def is_complete(self) -> bool:
-        """Return whether all runs are in the table."""
-        return (self.folder / RUNS).exists()
-
     def find_finished(self, tasks: Sequence[Work]) -> set[str]:
         """Return the names of the finished tasks."""
-        return {task.name for task in tasks if self._get_part_path(task).exists()}
+        return {task.name for task in tasks if self._get_path(task).exists()}
 
     def keep(self, task: Work, columns: Columns) -> None:
         """Write a task's rows; once this returns, they survive a kill.
@@ -124,43 +91,11 @@ class Store:
         Raises:
             UavctlError: They cannot be written.
         """
-        draft = self._get_part_path(task).with_suffix(".draft")
+        path = self._get_path(task)
+        draft = path.with_name(f".{path.name}.draft")  # readers of the table pass over files with a point
         with self._convert_disk_errors():
-            pq.write_table(make_table(columns, self._schema), draft, **_WRITER)
-            _rename_synced(draft, self._get_part_path(task))
-
-    def finish(self, tasks: Sequence[Work]) -> Path:
-        """Put all parts together, in order, and remove them.
-
-        Raises:
-            UavctlError: A part is damaged, or the table cannot be written.
-        """
-        path = self.folder / RUNS
-        with self._convert_disk_errors():
-            if not self.is_complete():
-                draft = path.with_suffix(".draft")
-                cell_records = read_document(self.folder, dict[str, Any])["cells"]
-                cells = {record["index"]: record for record in cell_records}
-                types = {
-                    name: _F64 if name == "rate_hz" else pa.string()
-                    for name in CELL_COLUMNS
-                    if all(name in cell for cell in cell_records)
-                }
-                names = list(types.items())
-                fields = [self._schema.field(position) for position in range(len(self._schema.names))]
-                schema = pa.schema([fields[0], *names, *fields[1:]])
-                with pq.ParquetWriter(draft, schema, **_WRITER) as writer:
-                    for cell, cell_tasks in groupby(tasks, lambda task: task.cell):
-                        table = pa.concat_tables([self._read_part(task) for task in cell_tasks]).combine_chunks()
-                        for position, (name, column_type) in enumerate(types.items(), 1):
-                            values = pa.array([cells[cell][name]] * table.num_rows, type=column_type)
-                            table = table.add_column(position, name, values)
-                        writer.write_table(table, row_group_size=_GROUP_ROWS)
-                _rename_synced(draft, path)
-            for part in self._parts.iterdir():
-                part.unlink()
-            self._parts.rmdir()
-        return path
+            pq.write_table(self._name_cell(make_table(columns, self._schema), task.cell), draft, **_WRITER)
+            _rename_synced(draft, path)
 
     @contextmanager
     def _convert_disk_errors(self) -> Iterator[None]:
@@ -171,19 +106,16 @@ class Store:
                 f"{self.folder}: {error.strerror or error}; make room or mend it, and go on with --resume"
             ) from error
 
-    def _get_part_path(self, task: Work) -> Path:
-        return self._parts / f"{task.name}.parquet"
+    def _get_path(self, task: Work) -> Path:
+        return self.table / f"{task.name}.parquet"
 
-    def _read_part(self, task: Work) -> pa.Table:
-        try:
-            rows = pq.read_metadata(self._get_part_path(task)).num_rows
-            if rows != task.runs:
-                raise pa.ArrowInvalid(f"{rows} runs instead of {task.runs}")
-            return pq.read_table(self._get_part_path(task), schema=self._schema)
-        except (pa.ArrowException, OSError) as error:
-            raise UavctlError(
-                f"{self._get_part_path(task)} is damaged ({error}); remove it and go on with --resume"
-            ) from error
+    def _name_cell(self, table: pa.Table, cell: int) -> pa.Table:
+        """Return the table with columns that name the cell, after its index."""
+        record = self._cells[cell]
+        for position, name in enumerate((name for name in CELL_COLUMNS if name in record), 1):
+            values = pa.array([record[name]] * table.num_rows, type=pa.float64() if name == "rate_hz" else pa.string())
+            table = table.add_column(position, name, values)
+        return table
 
     def _begin(self, document: Mapping[str, object], specification: str, resume: bool) -> None:
         self.check(resume)
@@ -205,7 +137,7 @@ def make_table(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
     arrays = []
     for name in schema.names:
         field, values = schema.field(name), columns[name]
-        is_histogram = name in ("ages", "outside")
+        is_histogram = field.type == pa.list_(pa.int64())
         arrays.append(
             _trim_histograms(values) if is_histogram else pa.array(values, type=field.type, from_pandas=False)
         )
@@ -233,7 +165,7 @@ def _trim_histograms(counts: NDArray[np.generic]) -> pa.ListArray:
     lengths = np.where(counts.any(axis=1), lengths, 0)
     is_used = np.arange(counts.shape[1]) < lengths[:, None]
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(counts[is_used], type=_I64))
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(counts[is_used], type=pa.int64()))
 
 
 def _lock_folder(descriptor: int, folder: Path) -> None:

@@ -13,6 +13,8 @@ from itertools import product
 
 import msgspec
 import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
 
 from uavctl import __version__
 from uavctl.arrays import Array, Flags
@@ -30,6 +32,7 @@ from uavctl.lab.campaign.controllers import (
 )
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.position_filter import PositionFilter
+from uavctl.lab.campaign.results import SCHEMA
 from uavctl.lab.campaign.spec import CHUNK, Campaign
 from uavctl.lab.campaign.verdicts import SMPC
 from uavctl.lab.campaign.world import MeasuredPositions, Trajectories, simulate
@@ -37,7 +40,7 @@ from uavctl.lab.trial import NEAR_M, NEARER_M, compute_exact_usable_share, get_r
 from uavctl.smpc.batch import Tally
 from uavctl.smpc.plant import AXES
 
-VERSION = 1
+VERSION = 2  # of `campaign.json` and the table: 2 keeps a file for each task
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +190,6 @@ def _find_first_time_s(is_near: Flags, dt_s: float) -> Array:
 
 
 _TALLY_COLUMNS = ("decisions", "infeasible", "slack_used", "fallbacks")
-_INTEGER_COLUMNS = ("steps", "state_violations", "input_violations", "saturated", "max_age", *_TALLY_COLUMNS)
-_PATH_COLUMNS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")
-_FLOAT_COLUMNS = ("cost", "settled_cost", "mean_square_input", "largest_gap", *_PATH_COLUMNS)
 _LIMIT_TOLERANCE = 1e-9
 
 
@@ -255,16 +255,17 @@ def _fly_single_run(task: Task, run: int) -> Columns:
 
 
 def _make_empty_columns(task: Task, first: int, runs: int, error: str) -> Columns:
-    columns: Columns = {
-        "cell": np.full(runs, task.cell, dtype=np.int32),
-        "run": np.arange(first, first + runs, dtype=np.int64),
-        "error": np.full(runs, error, dtype=object),
-        "age_sum": np.zeros(runs, dtype=np.int64),
-        **{name: np.zeros((runs, task.setting.spec.steps), dtype=np.int64) for name in ("ages", "outside")},
-    }
-    columns.update({name: np.zeros(runs, dtype=np.int32) for name in _INTEGER_COLUMNS})
-    columns.update({name: np.full(runs, np.nan) for name in _FLOAT_COLUMNS})
-    return columns
+    columns: Columns = {name: _make_empty_column(name, runs, task.setting.spec.steps) for name in SCHEMA.names}
+    numbers = np.arange(first, first + runs)
+    return columns | {"cell": np.full(runs, task.cell), "run": numbers, "error": np.full(runs, error, dtype=object)}
+
+
+def _make_empty_column(name: str, runs: int, steps: int) -> NDArray[np.generic]:
+    """Return a column of the table before anything is known: histograms (runs, steps), else (runs,)."""
+    column_type = SCHEMA.field(name).type
+    if column_type == pa.float64():
+        return np.full(runs, np.nan)
+    return np.zeros((runs, steps) if column_type == pa.list_(pa.int64()) else runs, dtype=np.int64)
 
 
 def _compute_figures(task: Task, first: int, runs: int) -> Columns:

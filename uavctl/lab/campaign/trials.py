@@ -111,7 +111,7 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     link: Annotated[tuple[LinkSpec, ...], declare("links", length=(1, MAX_TABLES))] = (LinkSpec(name="as configured"),)
 
 
-VERSION = 1
+VERSION = 2  # of `campaign.json` and the table: 2 keeps a file for each task
 CHUNK = 5  # flights of a task: a minute or less
 _INTEGER_COLUMNS = ("positions",)
 _TEXT_COLUMNS = ("mode",)
@@ -365,7 +365,7 @@ def summarise_trial(folder: Path) -> tuple[TrialRecord, list[TrialSummary]]:
         UavctlError: The folder has no results that can be read.
     """
     record = read_document(folder, TrialRecord)
-    return record, read_cells(folder, record.cells, ("error", "mode", *FLOAT_COLUMNS), _summarise_cell)
+    return record, read_cells(folder, record.cells, SCHEMA, _summarise_cell)
 
 
 def _summarise_cell(rows: pa.Table, place: TrialCellRecord) -> TrialSummary:
