@@ -167,8 +167,8 @@ def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path)
         result = simulate(meets.world, build_from_recipe(cell.recipe), meets.newest_captures, meets.disturbances)
         assert not result.failed.any()
         costs.append(result.cost.sum(axis=1).mean())
-    assert describe_cell(others[0])["promised_x"] == pytest.approx(0.05)
-    assert describe_cell(others[1])["promised_x"] is None
+    assert describe_cell(others[0]).promised_x == pytest.approx(0.05)
+    assert describe_cell(others[1]).promised_x is None
     assert max(costs) < 1.03 * min(costs)
 
 

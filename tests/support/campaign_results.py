@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from uavctl.lab.campaign.results import SCHEMA
+from uavctl.lab.campaign.results import SCHEMA, VERSION, CellSummary, read_results, summarise_cell
 
 STEPS = 50
 _EMPTY = {name: float("nan") if SCHEMA.field(name).type == pa.float64() else 0 for name in SCHEMA.names}
@@ -40,7 +40,8 @@ def write(folder: Path, cells: Sequence[Mapping[str, Any]], rows: Sequence[Mappi
     """A finished campaign."""
     folder.mkdir(parents=True, exist_ok=True)
     count = max((row["run"] for row in rows), default=0) + 1
-    document = {"version": 1, "name": "by hand", "uavctl_version": "9.9", "master": 7, "runs": count, "steps": STEPS}
+    document = {"version": VERSION, "name": "by hand", "uavctl_version": "9.9", "master": 7, "runs": count}
+    document |= {"steps": STEPS, "spec": {}, "configuration": ""}
     (folder / "campaign.json").write_bytes(msgspec.json.encode({**document, "cells": list(cells)}))
     (folder / "runs.parquet").mkdir(exist_ok=True)
     for index in dict.fromkeys(row["cell"] for row in rows):
@@ -53,3 +54,9 @@ def put(folder: Path, index: int, table: pa.Table, first: int = 0) -> Path:
     path = folder / "runs.parquet" / f"{index:05d}-{first:08d}.parquet"
     pq.write_table(table, path)
     return path
+
+
+def summarise(folder: Path) -> list[CellSummary]:
+    """Figures of every cell of a campaign."""
+    results = read_results(folder)
+    return [summarise_cell(results, one) for one in results.record.cells]

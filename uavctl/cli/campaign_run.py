@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -24,7 +24,7 @@ from uavctl.cli.signals import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
-from uavctl.lab.campaign.results import SCHEMA, CellSummary, summarise
+from uavctl.lab.campaign.results import SCHEMA, CampaignRecord, CellSummary
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.store import Store
 from uavctl.lab.campaign.tasks import make_cells, make_document, make_tasks
@@ -37,7 +37,6 @@ from uavctl.lab.campaign.trials import (
     make_trial_document,
     make_trial_tasks,
     read_trial,
-    summarise_trial,
 )
 from uavctl.lab.trial import COUNT_FIGURES, FIGURE_NOTE, SCENARIO_FIGURES
 
@@ -108,7 +107,7 @@ def fly_campaign(
         raise UsageError("--workers are this machine's, --dask has its own; give one of them")
     if resume and out is None:
         raise UsageError("--resume: give the campaign's folder with --out")
-    campaign = _prepare_trials(spec, runs) if is_trial_file(spec) else _prepare_runs(spec, runs)
+    campaign: _PreparedCampaign[Any] = _prepare_trials(spec, runs) if is_trial_file(spec) else _prepare_runs(spec, runs)
     begin_s = time.perf_counter()
     store = Store(out or _make_folder_path(campaign.name), campaign.schema)
     store.check(resume)  # the designs may take minutes
@@ -121,11 +120,16 @@ def fly_campaign(
             if not _fly_tasks(store, tasks, workers_context):
                 raise KeyboardInterrupt
             print_message("writing the page")
-            report = campaign.write(store.folder)
+            report, cells = campaign.write(store.folder)
     except KeyboardInterrupt:
         print_message(_describe_interruption(store, spec, runs))
         return INTERRUPTED
-    return campaign.conclude(store, report, time.perf_counter() - begin_s, json)
+    wall_s = time.perf_counter() - begin_s
+    result = CampaignResult(
+        name=campaign.name, runs_file=str(store.table), report=str(report), wall_s=wall_s, cells=cells
+    )
+    Common(json=json).show("campaign", result, lambda: campaign.render(result))
+    return 0 if any(cell.runs > cell.failed for cell in cells) else 1
 
 
 @dataclass(frozen=True)
@@ -135,53 +139,31 @@ class _PreparedCampaign(Generic[S]):
     name: str  # its name
     text: str  # text of the campaign's file
     schema: pyarrow.Schema  # schema of the table of runs
-    # Makes the document of `campaign.json` and all tasks
-    prepare: Callable[[], tuple[Mapping[str, object], Sequence[Work]]]
-    write: Callable[[Path], Path]  # writes the page into a folder
-    summarise: Callable[[Path], list[S]]  # computes the figures of the cells in a folder
+    prepare: Callable[[], tuple[CampaignRecord[Any], Sequence[Work]]]  # makes the document and all tasks
+    write: Callable[[Path], tuple[Path, list[S]]]  # writes the page into a folder; returns the figures too
     render: Callable[[CampaignResult[S]], RenderableType]
-
-    def conclude(self, store: Store, report: Path, wall_s: float, json: bool) -> int:
-        """Show the result; return the exit code."""
-        result = CampaignResult(
-            name=self.name,
-            runs_file=str(store.table),
-            report=str(report),
-            wall_s=wall_s,
-            cells=self.summarise(store.folder),
-        )
-        Common(json=json).show("campaign", result, lambda: self.render(result))
-        return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
 
 
 def _prepare_runs(spec: Path, runs: int | None) -> _PreparedCampaign[CellSummary]:
     """Prepare a campaign in the linear world."""
     campaign, text = read_campaign(spec, runs)
 
-    def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
+    def prepare() -> tuple[CampaignRecord[Any], Sequence[Work]]:
         cells = make_cells(campaign)
         return make_document(campaign, cells), list(make_tasks(cells))
 
-    return _PreparedCampaign(campaign.spec.name, text, SCHEMA, prepare, write_report, summarise, _render_runs)
+    return _PreparedCampaign(campaign.spec.name, text, SCHEMA, prepare, write_report, _render_runs)
 
 
 def _prepare_trials(path: Path, runs: int | None) -> _PreparedCampaign[TrialSummary]:
     """Prepare a campaign in the world of the quadrotor."""
     spec, text = read_trial(path, runs)
 
-    def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
+    def prepare() -> tuple[CampaignRecord[Any], Sequence[Work]]:
         places = make_trial_cells(spec)
         return make_trial_document(spec, places), list(make_trial_tasks(spec, places))
 
-    return _PreparedCampaign(
-        spec.name,
-        text,
-        TRIAL_SCHEMA,
-        prepare,
-        write_trial_report,
-        lambda folder: summarise_trial(folder)[1],
-        render_trials,
-    )
+    return _PreparedCampaign(spec.name, text, TRIAL_SCHEMA, prepare, write_trial_report, render_trials)
 
 
 def _make_folder_path(name: str) -> Path:

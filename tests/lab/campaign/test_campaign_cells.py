@@ -76,11 +76,10 @@ def test_a_design_that_is_refused_costs_its_cells_only(tmp_path: Path) -> None:
     assert [bool(cell.refused) for cell in made_cells] == [False, True, False, False]
     assert made_cells[1].refused.startswith("smpc.delta_x: 0.95 is out of reach") and made_cells[1].recipe is None
     assert {task.cell for task in make_tasks(made_cells)} == {0, 2, 3}
-    cell_records = make_document(campaign, made_cells)["cells"]
-    assert isinstance(cell_records, list)
-    assert cell_records[1]["refused"] == made_cells[1].refused and cell_records[1]["design_id"] is None
-    assert cell_records[0]["promised_x"] == pytest.approx(0.05) and cell_records[0]["link_loss"] == 0.3
-    assert cell_records[2]["promised_x"] is None and cell_records[2]["kind"] == "lqg"
+    cell_records = make_document(campaign, made_cells).cells
+    assert cell_records[1].refused == made_cells[1].refused and cell_records[1].design_id is None
+    assert cell_records[0].promised_x == pytest.approx(0.05) and cell_records[0].link_loss == 0.3
+    assert cell_records[2].promised_x is None and cell_records[2].kind == "lqg"
 
 
 def test_a_plant_that_cannot_be_flown_is_refused_too(tmp_path: Path) -> None:
@@ -135,7 +134,7 @@ def test_every_kind_of_controller_flies(tmp_path: Path) -> None:
     recipes = [cell.recipe for cell in made_cells if cell.recipe is not None]
     assert isinstance(build_from_recipe(recipes[0]), BatchSmpc) and isinstance(build_from_recipe(recipes[1]), Lqg)
     assert recipes[6].gains is not None
-    assert describe_cell(made_cells[6])["gains"] == {
+    assert describe_cell(made_cells[6]).gains == {
         name: getattr(recipes[6].gains, name).tolist()
         for name in ("position_1ps", "velocity_1ps", "integral_1ps2", "derivative", "speed")
     }

@@ -8,14 +8,14 @@ from html import unescape
 from itertools import pairwise
 
 import pytest
-from campaign_results import cell, runs, write
+from campaign_results import cell, runs, summarise, write
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
 from logs.report.svg import Drawing
 from uavctl.lab.campaign import plots
 from uavctl.lab.campaign.plots import ControllerStyles
-from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.results import read_results
 from uavctl.lab.campaign.verdicts import group_cells, make_verdicts
 
 LINKS = (

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from campaign_results import cell, runs, write
+from campaign_results import cell, runs, summarise, write
 from report_rig import omit_figures
 from text_numbers import find_numbers
 
@@ -20,7 +20,7 @@ from logs.report.svg import Drawing
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.page import CampaignView, describe_outcome, write_report
 from uavctl.lab.campaign.plots import ControllerStyles
-from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.results import read_results
 from uavctl.lab.campaign.verdicts import (
     CampaignVerdict,
     describe_briefly,
@@ -146,7 +146,7 @@ def test_the_promise_is_judged_by_the_measured_rates(
     rows = runs(0, SMPC[: len(hits)].tolist(), state_violations=hits)
     folder = write(tmp_path, [cell(0, "ours", "smpc")], rows)
     with omit_figures():
-        text = text_of(write_report(folder))
+        text = text_of(write_report(folder)[0])
     word = "Promise kept" if len(cells) == 1 and rate <= 5.0 else "Perhaps too often" if chance else "Promise broken"
     (first,) = re.findall(rf"{word}: (.*?allowed)", text)
     assert find_numbers(first) == [*cells, rate, 5.0]
@@ -252,7 +252,7 @@ def test_every_figure_has_a_text_alternative(grid: Path) -> None:
     ],
 )  # fmt: skip
 def test_campaigns_of_odd_shapes_have_a_page(cells: Any, rows: Any, text: str, tmp_path: Path) -> None:
-    assert text in text_of(write_report(write(tmp_path, cells, rows)))
+    assert text in text_of(write_report(write(tmp_path, cells, rows))[0])
 
 
 def test_a_page_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
@@ -271,7 +271,7 @@ def test_the_reason_of_a_refused_cell_is_a_row_over_all_columns(grid: Path) -> N
 def test_numbers_below_the_axis_of_differences_do_not_touch(tmp_path: Path) -> None:
     rows = [*runs(0, SMPC.tolist()), *runs(1, (SMPC * 0.9).tolist()), *runs(2, (SMPC * 40.0).tolist())]
     folder = write(tmp_path, [cell(0, "ours", "smpc"), cell(1, "less"), cell(2, "more")], rows)
-    html = write_report(folder).read_text(encoding="utf-8")
+    html = write_report(folder)[0].read_text(encoding="utf-8")
     (drawn,) = re.findall(r'<figure id="difference-s0-0".*?</figure>', html, re.DOTALL)
     shown = re.findall(r">([−-]?[0-9]+k?)</text>", drawn)
     assert "1000" in shown and "3000" not in shown

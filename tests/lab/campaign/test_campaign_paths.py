@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaign_results import cell, runs, write
+from campaign_results import cell, runs, summarise, write
 
 from uavctl.arrays import Array
 from uavctl.config import load_config
-from uavctl.lab.campaign.page import render_report
-from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.page import CampaignView, render_report
+from uavctl.lab.campaign.results import read_results
 from uavctl.lab.campaign.tasks import compute_path_figures
 from uavctl.lab.trial import compute_exact_usable_share
 from uavctl.wiring.controller import build_conditioned, build_design
@@ -80,8 +80,8 @@ def test_the_page_shows_path_figures_where_there_are_any(tmp_path: Path) -> None
         0.2,
         0.25,
     )
-    page = render_report(read_results(new))
+    page = render_report(CampaignView.make(read_results(new)))
     assert "Through the room" in page and "79" in page and "0.25" in page
     without = write(tmp_path / "without", [cell(0, "ours", "smpc")], runs(0, [1.0, 2.0]))
     assert summarise(without)[0].beyond_m is None
-    assert "Through the room" not in render_report(read_results(without))
+    assert "Through the room" not in render_report(CampaignView.make(read_results(without)))

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 import pytest
-from campaign_results import STEPS, cell, put, runs, write
+from campaign_results import STEPS, cell, put, runs, summarise, write
 from scipy.optimize import brentq
 from scipy.stats import binom
 
@@ -24,12 +24,11 @@ from logs.report.run_statistics import (
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.results import (
     SCHEMA,
-    CampaignRecord,
+    LinearCampaignRecord,
     compute_difference,
     read_cells,
     read_document,
     read_results,
-    summarise,
 )
 
 
@@ -263,7 +262,7 @@ def test_the_rows_of_one_cell_are_in_memory_at_a_time(tmp_path: Path) -> None:
         folder = write(tmp_path / str(cells), [cell(index, "a") for index in range(cells)], rows)
         before = pa.total_allocated_bytes()
         sizes: list[int] = []
-        document = read_document(folder, CampaignRecord)
+        document = read_document(folder, LinearCampaignRecord)
         read_cells(
             folder,
             document.cells,

@@ -8,16 +8,19 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from campaign_rig import cells, controller, table
+from msgspec.structs import replace
 
 from uavctl.errors import UavctlError, UsageError
-from uavctl.lab.campaign.results import SCHEMA
+from uavctl.lab.campaign.results import SCHEMA, CampaignRecord, CellRecord
 from uavctl.lab.campaign.spec import CHUNK
 from uavctl.lab.campaign.store import Store, find_first_difference, make_table
 from uavctl.lab.campaign.tasks import Task, fly_task, make_tasks
 
 TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
-CELLS = [{"index": 0, "controller": "lqg", "link": "a"}, {"index": 1, "controller": "lqg", "link": "b"}]
-DOCUMENT = {"name": "one", "runs": 3, "cells": CELLS}
+CELLS = [
+    CellRecord(index=index, controller="lqg", link=link, kind="lqg", refused="") for index, link in enumerate("ab")
+]
+DOCUMENT = CampaignRecord(name="one", uavctl_version="9.9", master=0, runs=3, spec={}, configuration="", cells=CELLS)
 
 
 @pytest.fixture
@@ -67,7 +70,7 @@ def test_only_the_same_campaign_continues_and_only_with_resume(tmp_path: Path) -
         pass
     with store.open(DOCUMENT, "text", resume=True):
         pass
-    other = {**DOCUMENT, "cells": [{"index": 1, "controller": "lqg", "link": "a"}, *CELLS[1:]]}
+    other = replace(DOCUMENT, cells=[replace(CELLS[0], index=1), *CELLS[1:]])
     with (
         pytest.raises(UsageError, match=r"cells\[0\]\.index is 0 there and 1 here"),
         store.open(other, "text", resume=True),

@@ -59,7 +59,7 @@ class CampaignView:
     @classmethod
     def make(cls, results: Results) -> Self:
         """Compute the figures of a campaign."""
-        cells = [summarise_cell(results, cell) for cell in results.cells]
+        cells = [summarise_cell(results, cell) for cell in results.record.cells]
         groups = group_cells(cells)
         smpc_names = [cell.controller for cell in cells if cell.kind == SMPC]
         styles = ControllerStyles(tuple(dict.fromkeys([*smpc_names, *(cell.controller for cell in cells)])))
@@ -84,12 +84,12 @@ class CampaignView:
 
 def describe_outcome(view: CampaignView) -> Iterator[str]:
     """Yield sentences on the outcome of a campaign, made from its figures."""
-    results, cells = view.results, view.cells
+    record, cells = view.results.record, view.cells
     refused = sum(bool(cell.refused) for cell in cells)
     failed = sum(cell.failed for cell in cells)
     flown = sum(cell.runs for cell in cells)
     yield (
-        f"{count(flown, 'run')} of {count(results.steps, 'step')} were flown: {count(results.planned, 'run')} for each "
+        f"{count(flown, 'run')} of {count(record.steps, 'step')} were flown: {count(record.runs, 'run')} for each "
         f"of {count(len(cells) - refused, 'cell')}, all cells on the same disturbances and losses."
     )
     if refused:
@@ -182,16 +182,14 @@ _INTERVAL_NOTE = (
 )
 
 
-def write_report(folder: Path) -> Path:
-    """Write the page of a campaign into its folder.
-
-    Returns:
-        Its path.
+def write_report(folder: Path) -> tuple[Path, list[CellSummary]]:
+    """Write the page of a campaign into its folder; return its path, and the figures of every cell.
 
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
-    return write_html(folder, render_report(read_results(folder)))
+    view = CampaignView.make(read_results(folder))
+    return write_html(folder, render_report(view)), view.cells
 
 
 def write_html(folder: Path, text: str) -> Path:
@@ -216,11 +214,11 @@ def render_specification(folder: Path) -> Markup:
         return NOTHING
 
 
-def render_report(results: Results) -> str:
+def render_report(view: CampaignView) -> str:
     """Return the page of a campaign as HTML."""
-    view = CampaignView.make(results)
-    subtitle = f"{count(len(view.cells), 'cell')} · seed {results.master} · uavctl {results.version}"
-    return render_page(f"Campaign “{results.name}”", subtitle, _list_sections(view), view, _judge_campaign(view))
+    record = view.results.record
+    subtitle = f"{count(len(view.cells), 'cell')} · seed {record.master} · uavctl {record.uavctl_version}"
+    return render_page(f"Campaign “{record.name}”", subtitle, _list_sections(view), view, _judge_campaign(view))
 
 
 def _show_compared(view: CampaignView) -> Iterator[Part]:
@@ -234,8 +232,8 @@ def _show_compared(view: CampaignView) -> Iterator[Part]:
         ("Links", join_names(cell.link for cell in cells)),
         ("Disturbances", join_names(cell.disturbance for cell in cells)),
         ("Plants", join_names(cell.plant for cell in cells)),
-        ("Runs of a cell", f"{results.planned} of {count(results.steps, 'step')}"),
-        ("Seed", f"{results.master}; run i of every cell has the draws of (seed, i)"),
+        ("Runs of a cell", f"{results.record.runs} of {count(results.record.steps, 'step')}"),
+        ("Seed", f"{results.record.master}; run i of every cell has the draws of (seed, i)"),
     ]
     yield render_facts(rows)
     yield render_specification(results.folder)
@@ -269,7 +267,9 @@ def _make_scene_section(
 ) -> PageSection[CampaignView]:
     """Make the section on costs and limits in one disturbance and plant."""
     losses = {
-        cell.link: cell.link_loss for cell in view.results.cells if cell.link_loss is not None and not cell.refused
+        cell.link: cell.link_loss
+        for cell in view.results.record.cells
+        if cell.link_loss is not None and not cell.refused
     }
     flown = {cell.controller for cell in cells if cell.cost is not None}
     return PageSection(

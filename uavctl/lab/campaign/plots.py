@@ -305,7 +305,7 @@ def draw_ages(cells: Sequence[CellSummary], results: Results) -> Iterator[Drawin
             by_link[cell.link] = cell.ages
     if not by_link:
         return
-    steps = results.planned * results.steps
+    steps = results.record.runs * results.record.steps
     label = f"Share of {steps} steps in which the age of information is at least j, by link"
     with open_canvas("ages", 2.8) as canvas:
         _draw_tails(canvas.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))

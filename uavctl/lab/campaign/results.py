@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 import numpy as np
@@ -28,6 +28,7 @@ from uavctl.arrays import Array, Flags
 from uavctl.errors import RecordingError, UavctlError
 
 DOCUMENT, RUNS = "campaign.json", "runs.parquet"
+VERSION = 2  # of both; 2 keeps a file for each task
 
 
 _I32, _I64, _F64 = pa.int32(), pa.int64(), pa.float64()
@@ -94,17 +95,26 @@ class CellFigures(CellRecord, frozen=True, kw_only=True):
     promised_x: float | None = None  # 1 - δ_x
     promised_u: float | None = None  # 1 - δ_u
     link_loss: float | None = None  # of the flown link, where losses are independent and nothing else acts
+    gains: dict[str, Any] | None = None  # of a PID
 
 
-class CampaignRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A campaign as `campaign.json` has it."""
+class CampaignRecord(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
+    """A campaign in any world as `campaign.json` has it."""
 
+    version: int = VERSION
     name: str
     uavctl_version: str
     master: int
     runs: int
+    spec: dict[str, Any]  # the specification, every default written out
+    configuration: str  # TOML text of the base configuration
+    cells: list[C]
+
+
+class LinearCampaignRecord(CampaignRecord[CellFigures], frozen=True, kw_only=True):
+    """A campaign in the linear world as `campaign.json` has it."""
+
     steps: int
-    cells: list[CellFigures]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +137,7 @@ class Results:
     """Results of a campaign."""
 
     folder: Path  # where it is
-    name: str  # its name
-    version: str  # of the program that flew it
-    master: int  # seed of all its draws
-    planned: int  # runs of a cell that were asked for
-    steps: int  # steps of a run
-    cells: tuple[CellFigures, ...]  # what was compared, in the order of the specification
+    record: LinearCampaignRecord  # its document
     runs: dict[int, CampaignRuns]  # the runs of each cell, by its index; none of a cell that was refused
 
 
@@ -142,21 +147,9 @@ def read_results(folder: Path) -> Results:
     Raises:
         UavctlError: One of them is missing or damaged.
     """
-    record = read_document(folder, CampaignRecord)
-    runs = {
-        cell.index: cell_runs
-        for cell, cell_runs in zip(record.cells, read_cells(folder, record.cells, SCHEMA, _collect_runs), strict=True)
-    }
-    return Results(
-        folder=folder,
-        name=record.name,
-        version=record.uavctl_version,
-        master=record.master,
-        planned=record.runs,
-        steps=record.steps,
-        cells=tuple(record.cells),
-        runs=runs,
-    )
+    record = read_document(folder, LinearCampaignRecord)
+    runs = read_cells(folder, record.cells, SCHEMA, _collect_runs)
+    return Results(folder, record, {cell.index: figures for cell, figures in zip(record.cells, runs, strict=True)})
 
 
 def read_document(folder: Path, kind: type[D]) -> D:
@@ -306,26 +299,16 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     settled_violation_rate: float | None = None  # share of steps with a state outside, second half of the runs
 
 
-def summarise(folder: Path) -> list[CellSummary]:
-    """Return the figures of every cell of a campaign.
-
-    Raises:
-        UavctlError: The folder has no results that can be read.
-    """
-    results = read_results(folder)
-    return [summarise_cell(results, cell) for cell in results.cells]
-
-
 def summarise_cell(results: Results, cell: CellFigures) -> CellSummary:
     """Return the figures of one cell."""
-    runs = results.runs[cell.index]
+    runs, steps = results.runs[cell.index], results.record.steps
     n = runs.index.size
-    state, runs_outside = _estimate_rates(runs["state_violations"], results.steps)
-    inputs, _ = _estimate_rates(runs["input_violations"], results.steps)
+    state, runs_outside = _estimate_rates(runs["state_violations"], steps)
+    inputs, _ = _estimate_rates(runs["input_violations"], steps)
     cost, settled = _estimate_mean(runs["cost"]), _estimate_mean(runs["settled_cost"])
     gaps = runs["largest_gap"][np.isfinite(runs["largest_gap"])]
-    worst = max_step_rate(runs.outside, n, results.steps) if n else (None, None)
-    settled_outside = runs.outside[results.steps // 2 :]
+    worst = max_step_rate(runs.outside, n, steps) if n else (None, None)
+    settled_outside = runs.outside[steps // 2 :]
     (ages,) = np.nonzero(runs.ages)
     summary_fields = CellSummary.__struct_fields__
     shared_fields: dict[str, Any] = {
@@ -355,9 +338,7 @@ def summarise_cell(results: Results, cell: CellFigures) -> CellSummary:
         beyond_m=_compute_finite(np.max, runs["beyond_m"]),
         worst_step_rate=worst[0],
         worst_step_ci=worst[1],
-        settled_violation_rate=(
-            float(settled_outside.sum() / (n * (results.steps - results.steps // 2))) if n else None
-        ),
+        settled_violation_rate=(float(settled_outside.sum() / (n * (steps - steps // 2))) if n else None),
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from logs.recording.replay import iterate_different_leaves
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.pool import Columns, Work
-from uavctl.lab.campaign.results import DOCUMENT, RUNS, SCHEMA, read_document
+from uavctl.lab.campaign.results import DOCUMENT, RUNS, SCHEMA, CampaignRecord, CellRecord, read_document
 
 SPECIFICATION = "campaign.toml"
 # Columns that name the cell of each row, in either world, so that the table can be read alone.
@@ -42,10 +42,10 @@ class Store:
         self.folder = folder
         self.table = folder / RUNS
         self._schema = schema
-        self._cells: dict[int, dict[str, Any]] = {}  # the document's record of each cell, by its index
+        self._cells: dict[int, CellRecord] = {}  # by their indices
 
     @contextmanager
-    def open(self, document: Mapping[str, object], specification: str, resume: bool) -> Iterator[None]:
+    def open(self, document: CampaignRecord[Any], specification: str, resume: bool) -> Iterator[None]:
         """Begin or continue a campaign; other processes are locked out.
 
         Args:
@@ -63,7 +63,7 @@ class Store:
                 _lock_folder(lock.fileno(), self.folder)
                 self._begin(document, specification, resume)
                 self.table.mkdir(exist_ok=True)
-                self._cells = {cell["index"]: cell for cell in read_document(self.folder, dict[str, Any])["cells"]}
+                self._cells = {cell.index: cell for cell in document.cells}
             yield
 
     def has_campaign(self) -> bool:
@@ -112,12 +112,14 @@ class Store:
     def _name_cell(self, table: pa.Table, cell: int) -> pa.Table:
         """Return the table with columns that name the cell, after its index."""
         record = self._cells[cell]
-        for position, name in enumerate((name for name in CELL_COLUMNS if name in record), 1):
-            values = pa.array([record[name]] * table.num_rows, type=pa.float64() if name == "rate_hz" else pa.string())
+        for position, name in enumerate((name for name in CELL_COLUMNS if hasattr(record, name)), 1):
+            values = pa.array(
+                [getattr(record, name)] * table.num_rows, type=pa.float64() if name == "rate_hz" else pa.string()
+            )
             table = table.add_column(position, name, values)
         return table
 
-    def _begin(self, document: Mapping[str, object], specification: str, resume: bool) -> None:
+    def _begin(self, document: CampaignRecord[Any], specification: str, resume: bool) -> None:
         self.check(resume)
         path = self.folder / DOCUMENT
         if resume:

@@ -32,15 +32,14 @@ from uavctl.lab.campaign.controllers import (
 )
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.position_filter import PositionFilter
-from uavctl.lab.campaign.results import SCHEMA
+from uavctl.lab.campaign.results import SCHEMA, CellFigures, LinearCampaignRecord
 from uavctl.lab.campaign.spec import CHUNK, Campaign
 from uavctl.lab.campaign.verdicts import SMPC
 from uavctl.lab.campaign.world import MeasuredPositions, Trajectories, simulate
 from uavctl.lab.trial import NEAR_M, NEARER_M, compute_exact_usable_share, get_room_limits
 from uavctl.smpc.batch import Tally
+from uavctl.smpc.pid import PidGains
 from uavctl.smpc.plant import AXES
-
-VERSION = 2  # of `campaign.json` and the table: 2 keeps a file for each task
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,45 +90,44 @@ def _make_cell(campaign: Campaign, index: int, indices: tuple[int, int, int, int
     )
 
 
-def make_document(campaign: Campaign, cells: tuple[Cell, ...]) -> dict[str, object]:
+def make_document(campaign: Campaign, cells: tuple[Cell, ...]) -> LinearCampaignRecord:
     """Return the content of `campaign.json`."""
     spec = campaign.spec
-    return {
-        "version": VERSION,
-        "name": spec.name,
-        "uavctl_version": __version__,
-        "master": spec.master,
-        "runs": spec.runs,
-        "steps": spec.steps,
-        "spec": msgspec.to_builtins(spec),
-        "configuration": campaign.configuration,
-        "cells": [describe_cell(cell) for cell in cells],
-    }
+    return LinearCampaignRecord(
+        name=spec.name,
+        uavctl_version=__version__,
+        master=spec.master,
+        runs=spec.runs,
+        steps=spec.steps,
+        spec=msgspec.to_builtins(spec),
+        configuration=campaign.configuration,
+        cells=[describe_cell(cell) for cell in cells],
+    )
 
 
-def describe_cell(cell: Cell) -> dict[str, object]:
+def describe_cell(cell: Cell) -> CellFigures:
     """Return the record of a cell in `campaign.json`."""
     recipe, (controller, link, disturbance, plant) = cell.recipe, cell.names
-    design, gains = (None, None) if recipe is None else (recipe.design, recipe.gains)
     smpc = None if recipe is None or cell.kind != SMPC else recipe.config.smpc
-    delta_u = None if smpc is None else smpc.delta_u
-    return {
-        "index": cell.index,
-        "controller": controller,
-        "link": link,
-        "disturbance": disturbance,
-        "plant": plant,
-        "kind": cell.kind,
-        "design_id": None if design is None else design.design_id,
-        "promised_x": None if smpc is None else 1.0 - smpc.delta_x,
-        "promised_u": None if delta_u is None else 1.0 - delta_u,
-        "gains": None
-        if gains is None
-        else {field.name: getattr(gains, field.name).tolist() for field in fields(gains)},
-        "link_loss": _get_plain_loss(cell.setting.link),
-        "usable_room": None if smpc is None or recipe is None else _get_usable_share(recipe),
-        "refused": cell.refused,
-    }
+    return CellFigures(
+        index=cell.index,
+        controller=controller,
+        link=link,
+        disturbance=disturbance,
+        plant=plant,
+        kind=cell.kind,
+        design_id=recipe.design.design_id if recipe and recipe.design else None,
+        promised_x=None if smpc is None else 1.0 - smpc.delta_x,
+        promised_u=None if smpc is None or smpc.delta_u is None else 1.0 - smpc.delta_u,
+        gains=_list_gains(recipe.gains) if recipe and recipe.gains else None,
+        link_loss=_get_plain_loss(cell.setting.link),
+        usable_room=None if smpc is None or recipe is None else _get_usable_share(recipe),
+        refused=cell.refused,
+    )
+
+
+def _list_gains(gains: PidGains) -> dict[str, list[float]]:
+    return {field.name: getattr(gains, field.name).tolist() for field in fields(gains)}
 
 
 def _get_usable_share(recipe: Recipe) -> float | None:

@@ -16,7 +16,7 @@ from logs.report.findings import Banner
 from logs.report.page import NOTHING, PageSection, Part, render_facts, render_list, render_page, render_table
 from uavctl.cause import BAD, CAUTION, GOOD
 from uavctl.lab.campaign.page import render_specification, write_html
-from uavctl.lab.campaign.trials import TrialRecord, TrialSummary, summarise_trial
+from uavctl.lab.campaign.trials import TrialCampaignRecord, TrialSummary, summarise_trial
 from uavctl.lab.trial import EXCESS_FIGURE, FIGURE_NOTE, SCENARIO_FIGURES, Scenario
 
 _SCENARIO_TITLES = {
@@ -32,19 +32,19 @@ _OWN_LOOP_NOTE = (
 )
 
 
-def write_trial_report(folder: Path) -> Path:
-    """Write the page of a campaign into its folder.
-
-    Returns:
-        Its path.
+def write_trial_report(folder: Path) -> tuple[Path, list[TrialSummary]]:
+    """Write the page of a campaign into its folder; return its path, and the figures of every cell.
 
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
-    return write_html(folder, render_trial_report(*summarise_trial(folder), render_specification(folder)))
+    record, cells = summarise_trial(folder)
+    return write_html(folder, render_trial_report(record, cells, render_specification(folder))), cells
 
 
-def render_trial_report(record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup = NOTHING) -> str:
+def render_trial_report(
+    record: TrialCampaignRecord, cells: Sequence[TrialSummary], specification: Markup = NOTHING
+) -> str:
     """Return the page of a campaign of trials as HTML."""
     subtitle = f"{count(len(cells), 'cell')} · seed {record.master} · uavctl {record.uavctl_version}"
     view = _TrialView(record, cells, specification)
@@ -54,7 +54,7 @@ def render_trial_report(record: TrialRecord, cells: Sequence[TrialSummary], spec
 class _TrialView(NamedTuple):
     """What the page shows: the campaign, the figures of its cells, and its file as HTML."""
 
-    record: TrialRecord
+    record: TrialCampaignRecord
     cells: Sequence[TrialSummary]
     specification: Markup
 

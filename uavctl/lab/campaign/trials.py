@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import cache
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,7 +23,7 @@ from uavctl.config.document import MAX_SEED, ConfigProblem, Section, declare
 from uavctl.config.load import parse_toml
 from uavctl.errors import RAISED, ConfigError, DesignError, in_words
 from uavctl.lab.campaign.pool import Columns, Work
-from uavctl.lab.campaign.results import CellRecord, read_cells, read_document, read_texts
+from uavctl.lab.campaign.results import CampaignRecord, CellRecord, read_cells, read_document, read_texts
 from uavctl.lab.campaign.spec import (
     CONFIGURATION,
     MAX_CELLS,
@@ -111,7 +112,6 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     link: Annotated[tuple[LinkSpec, ...], declare("links", length=(1, MAX_TABLES))] = (LinkSpec(name="as configured"),)
 
 
-VERSION = 2  # of `campaign.json` and the table: 2 keeps a file for each task
 CHUNK = 5  # flights of a task: a minute or less
 _INTEGER_COLUMNS = ("positions",)
 _TEXT_COLUMNS = ("mode",)
@@ -131,16 +131,32 @@ SCHEMA = pa.schema(
 )
 
 
-@dataclass(frozen=True)
-class NumberedTrialCell:
-    """One cell of a trial campaign."""
+class TrialPlace(CellRecord, frozen=True, kw_only=True):
+    """One cell of a campaign of flights; design and usable room are of a controller of ours."""
 
-    index: int  # its number
-    cell: TrialCell  # what is flown
-    kind: str  # kind of the controller
-    design_id: str | None  # identifies the controller's design; None for the vehicle's own loop
-    usable_room: float | None  # share of the room in which a plan may rest; None for the vehicle's own loop
-    refused: str  # why the cell is not flown; empty if it is
+    scenario: Scenario
+    autopilot: str
+    rate_hz: float
+    air: str
+
+
+class TrialCellRecord(TrialPlace, frozen=True, kw_only=True):
+    """A cell as it is written to `campaign.json`."""
+
+    own: dict[str, Any] | None  # setup of the vehicle's own loop; None for a controller of ours
+
+
+class TrialCampaignRecord(CampaignRecord[TrialPlace], frozen=True, kw_only=True):
+    """A campaign of flights as `campaign.json` has it."""
+
+    world: Literal["quadrotor"]
+
+
+class NumberedTrialCell(NamedTuple):
+    """One cell of a trial campaign: its record, and what is flown."""
+
+    record: TrialCellRecord
+    cell: TrialCell
 
 
 @dataclass(frozen=True)
@@ -190,19 +206,29 @@ def get_flight_seed(master: int, run: int) -> int:
 def make_trial_cells(spec: TrialSpec) -> tuple[NumberedTrialCell, ...]:
     """Return every cell of a campaign; a design that cannot be made is refused here."""
     text = dump_config(load_config(spec.config, spec.set))
-    designs: dict[Config, tuple[str | None, float | None, str]] = {}
+    make_design = cache(_make_design)
     axes = (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.link, spec.controller)
     cells = []
     for index, (scenario, autopilot, rate_hz, air, link, controller) in enumerate(product(*axes)):
         pilot = _make_pilot(spec, controller, autopilot, text)
         cell = TrialCell(pilot, scenario, autopilot, rate_hz, link.name, link.set, air)
-        design: tuple[str | None, float | None, str] = (None, None, "")
-        if pilot.position_loop is None:
-            config = make_design_config(cell)
-            if config not in designs:
-                designs[config] = _make_design(config)
-            design = designs[config]
-        cells.append(NumberedTrialCell(index, cell, controller.kind, *design))
+        own_loop = pilot.position_loop
+        design_id, usable_room, refused = (None, None, "") if own_loop else make_design(make_design_config(cell))
+        record = TrialCellRecord(
+            index=index,
+            controller=controller.name,
+            kind=controller.kind,
+            scenario=scenario,
+            autopilot=autopilot,
+            rate_hz=rate_hz,
+            air=air,
+            link=link.name,
+            design_id=design_id,
+            usable_room=usable_room,
+            own={**asdict(own_loop), "gains": dict(own_loop.gains)} if own_loop else None,
+            refused=refused,
+        )
+        cells.append(NumberedTrialCell(record, cell))
     return tuple(cells)
 
 
@@ -224,44 +250,25 @@ def _make_design(config: Config) -> tuple[str | None, float | None, str]:
 
 def make_trial_tasks(spec: TrialSpec, cells: Sequence[NumberedTrialCell]) -> Iterator[TrialTask]:
     """Return all tasks of a campaign, in order."""
-    for numbered in cells:
-        if not numbered.refused:
+    for record, cell in cells:
+        if not record.refused:
             for first in range(0, spec.runs, CHUNK):
                 runs = min(CHUNK, spec.runs - first)
-                yield TrialTask(numbered.index, first, runs, numbered.cell, spec.seconds, spec.from_s, spec.master)
+                yield TrialTask(record.index, first, runs, cell, spec.seconds, spec.from_s, spec.master)
 
 
-def make_trial_document(spec: TrialSpec, cells: Sequence[NumberedTrialCell]) -> dict[str, object]:
+def make_trial_document(spec: TrialSpec, cells: Sequence[NumberedTrialCell]) -> TrialCampaignRecord:
     """Return the content of `campaign.json`."""
-    return {
-        "version": VERSION,
-        "world": spec.world,
-        "name": spec.name,
-        "uavctl_version": __version__,
-        "master": spec.master,
-        "runs": spec.runs,
-        "spec": msgspec.to_builtins(spec),
-        "configuration": dump_config(load_config(spec.config, spec.set)),
-        "cells": [_describe_cell(cell) for cell in cells],
-    }
-
-
-def _describe_cell(numbered: NumberedTrialCell) -> dict[str, object]:
-    cell, own_loop = numbered.cell, numbered.cell.pilot.position_loop
-    return {
-        "index": numbered.index,
-        "controller": cell.pilot.name,
-        "kind": numbered.kind,
-        "scenario": cell.scenario,
-        "autopilot": cell.autopilot,
-        "rate_hz": cell.rate_hz,
-        "air": cell.air,
-        "link": cell.link_name,
-        "design_id": numbered.design_id,
-        "usable_room": numbered.usable_room,
-        "own": None if own_loop is None else {**asdict(own_loop), "gains": dict(own_loop.gains)},
-        "refused": numbered.refused,
-    }
+    return TrialCampaignRecord(
+        world=spec.world,
+        name=spec.name,
+        uavctl_version=__version__,
+        master=spec.master,
+        runs=spec.runs,
+        spec=msgspec.to_builtins(spec),
+        configuration=dump_config(load_config(spec.config, spec.set)),
+        cells=[record for record, _ in cells],
+    )
 
 
 def is_trial_file(path: Path) -> bool:
@@ -325,30 +332,10 @@ def _find_problems(spec: TrialSpec) -> Iterator[ConfigProblem]:
         )
 
 
-class TrialCellRecord(CellRecord, frozen=True, kw_only=True):
-    """A cell as `campaign.json` has it."""
-
-    scenario: Scenario
-    autopilot: str
-    rate_hz: float
-    air: str
-
-
-class TrialRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A campaign as `campaign.json` has it."""
-
-    name: str
-    world: Literal["quadrotor"]
-    uavctl_version: str
-    master: int
-    runs: int
-    cells: list[TrialCellRecord]
-
-
 class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a cell; null where a figure does not apply to its scenario, or is infinite."""
 
-    place: TrialCellRecord
+    place: TrialPlace
     runs: int
     failed: int
     median: dict[str, float | None]
@@ -358,17 +345,17 @@ class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
     values: dict[str, list[float]]
 
 
-def summarise_trial(folder: Path) -> tuple[TrialRecord, list[TrialSummary]]:
+def summarise_trial(folder: Path) -> tuple[TrialCampaignRecord, list[TrialSummary]]:
     """Return the figures of every cell of a campaign.
 
     Raises:
         UavctlError: The folder has no results that can be read.
     """
-    record = read_document(folder, TrialRecord)
+    record = read_document(folder, TrialCampaignRecord)
     return record, read_cells(folder, record.cells, SCHEMA, _summarise_cell)
 
 
-def _summarise_cell(rows: pa.Table, place: TrialCellRecord) -> TrialSummary:
+def _summarise_cell(rows: pa.Table, place: TrialPlace) -> TrialSummary:
     errors = read_texts(rows["error"])
     finished = [i for i, error in enumerate(errors) if not error]
     columns = {name: rows[name].to_pylist() for name in (*FLOAT_COLUMNS, "mode")}

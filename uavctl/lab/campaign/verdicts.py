@@ -108,7 +108,7 @@ def _compare_with_baseline(results: Results, smpc: CellSummary, baseline: CellSu
     a, b = results.runs[smpc.index], results.runs[baseline.index]
     cost = compute_difference(a, b, "cost")
     state, inputs = (
-        compute_difference(a, b, column, results.steps) for column in ("state_violations", "input_violations")
+        compute_difference(a, b, column, results.record.steps) for column in ("state_violations", "input_violations")
     )
     return BaselineComparison(smpc, baseline, cost, state, inputs)
 
