@@ -29,6 +29,7 @@ from uavctl.smpc.conditioned.adaptation import (
     SpreadState,
     charge_risk,
     compute_outside_risk,
+    compute_widening,
     count_age,
     count_innovation,
 )
@@ -196,7 +197,7 @@ def fly(
                     age=age,
                     cov=preview.cov,
                     level=ages.level if budgets == "observed" else CERTIFICATE_LEVEL,
-                    widening=loop.widening,
+                    widening=compute_widening(loop, spread.spread),
                     silence_widening=loop.silence_widening,
                 )
             plan, begun = solver.solve(0, mean, target, preview), k

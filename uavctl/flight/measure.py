@@ -308,13 +308,13 @@ def _judge_sample(
         if at_ns > (history.captured_ns or at_ns):
             later_error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
         sources = replace(sources, velocity_error_mps=later_error_mps, outliers=outlier_track)
-        if not sources.noise.is_known:
-            return sources, NO_VERDICT
         corrected = _correct_sample(sources, sample, at_ns)
-        if at_ns > (history.captured_ns or at_ns):
+        if sources.noise.is_measured and at_ns > (history.captured_ns or at_ns):
             sources = replace(
                 sources, spread=_count_innovation(kalman, sources.spread, offset[:n_axes], corrected, belief)
             )
+        if not sources.noise.is_known:
+            return sources, NO_VERDICT
         return _judge_jump(kalman, sources, offset, corrected, belief)
     if frozen.is_repeat(tracks[sample.source], at_ns):
         # A repeated value did not jump: the prediction has moved away from a source that is frozen.

@@ -19,7 +19,8 @@
 5. At the levels of observed links budgets are those of the link. Where the regulator is quick, the reference moves away
    from a limit with the age instead: stage t is flown with information a + t steps old, by the regulator around the
    reference r_{a+t} of that age, see `reference`. So z = 0 stands for the inputs u_t = u_s + K(x_t - r_{a+t}). The
-   distances keep the risk in the mean of all plans, so rows have no back-offs, but along motions.
+   distances keep the risk in the mean of all plans, so rows have no back-offs, but along motions. Where the regulator
+   is slow, programs weigh |z_t|² with the probability that stage t is flown, see `levels`.
 """
 
 from __future__ import annotations
@@ -235,6 +236,8 @@ class ConditionedSolver:
         if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         rest = self._find_rest(target, preview)
+        for program in self._parts:
+            program.weigh_stages(rest.allocation.weights)
         reference, equilibrium_input = rest.reference, rest.equilibrium_input
         row_backoffs = self._find_row_backoffs(rest.allocation, preview)
         first = (

@@ -6,7 +6,8 @@
 2. `RegulatedRows`: plan of the regulator for the whole plant, and the margin that it leaves in all rows: one product
    each. State rows stand side by side, part after part. Hard rows are in inputs alone and come part after part, each
    with its stages in order: rows of the input set, then both sides of its slew rows.
-3. `PartProgram`: min |z|² such that the rows are kept, with z = L'c and the change c of the regulator's inputs.
+3. `PartProgram`: min Σ_t s_t |z_t|² such that the rows are kept, with z = L'c, the change c of the regulator's inputs
+   and the weights s of the stages.
 4. `ReferenceEquilibria`: the equilibrium nearest to a target that keeps given limits.
 """
 
@@ -88,7 +89,7 @@ MAX_ITERATIONS = 2000  # of one program
 
 
 class PartProgram:
-    """min |z|² with all rows kept; state rows are soft; one row for both sides of a direction.
+    """min Σ_t s_t |z_t|² with all rows kept; state rows are soft; one row for both sides of a direction.
 
     Margins are one vector of the whole plant: state rows, stage after stage, then the hard rows part after part (see
     `RegulatedRows`), and OPEN at the end for a side without a limit.
@@ -146,20 +147,36 @@ class PartProgram:
         self._upper, self._lower = index_margins(above_x, above_u), index_margins(below_x, below_u)
         self._width = above_u.size  # of the hard rows of a stage
         self._slews = range(len(rows_x) + pairs_u[0].size, len(rows_x) + self._width)  # those of the first stage
-        soft = np.arange(len(rows)) < len(rows_x)
+        self._rows, self._is_soft = rows, np.arange(len(rows)) < len(rows_x)
+        self._slack_linear, self._slack_quadratic = problem.slack_linear, problem.slack_quadratic
+        # The program in y of each weights used so far, and z / y
+        self._programs: dict[bytes, tuple[QuadraticProgram, Array]] = {}
+        self.weigh_stages(np.ones(steps))
         by_stage = rows_x.reshape(steps, -1, n), rows_u.reshape(steps, -1, n)
-        self._program = QuadraticProgram(
-            2.0 * np.eye(n),
-            np.ascontiguousarray(rows),
-            np.where(soft, SOFT, 0).astype(np.int32),
-            np.where(soft, problem.slack_linear, 0.0),
-            np.where(soft, problem.slack_quadratic, 0.0),
-            max_iterations=MAX_ITERATIONS,
-            linear=False,
-        )
         is_suitable = WorkingSetGuess.is_suitable(*by_stage, len(d))
         self._guess_working_set = (
             WorkingSetGuess(*by_stage, self._program.sense).guess if is_suitable else self._guess_ramps
+        )
+
+    def weigh_stages(self, weights: Array) -> None:
+        """Select the weights s (H,) of the stages for the programs to come."""
+        key = weights.tobytes()
+        if key not in self._programs:
+            # y_t = s_t^½ z_t: min |y|²
+            scale = np.repeat(1.0 / np.sqrt(weights), self.part.inputs.size)
+            self._programs[key] = self._make_program(self._rows * scale), scale
+        self._program, self._z_per_y = self._programs[key]
+
+    def _make_program(self, rows: Array) -> QuadraticProgram:
+        """Make the program min |y|² whose rows are linear in y, (rows, n)."""
+        return QuadraticProgram(
+            2.0 * np.eye(rows.shape[1]),
+            np.ascontiguousarray(rows),
+            np.where(self._is_soft, SOFT, 0).astype(np.int32),
+            np.where(self._is_soft, self._slack_linear, 0.0),
+            np.where(self._is_soft, self._slack_quadratic, 0.0),
+            max_iterations=MAX_ITERATIONS,
+            linear=False,
         )
 
     def follow_path(self, path_x: Array, path_u: Array) -> Array:
@@ -210,13 +227,13 @@ class PartProgram:
             middle = 0.5 * (upper + lower)
             np.copyto(upper, middle, where=crossed)
             np.copyto(lower, middle, where=crossed)
-        z = self._program.solve_sides(upper, lower, working_set, reuse_rows)
-        if z is None and not reuse_rows:
+        y = self._program.solve_sides(upper, lower, working_set, reuse_rows)
+        if y is None and not reuse_rows:
             # DAQP cycles in rare programs. From other rows it takes another way: from those that z = 0 violates.
             sense = self._program.sense
             violated = np.where(upper < 0.0, sense + ACTIVE, np.where(lower > 0.0, sense + BELOW, sense))
-            z = self._program.solve_sides(upper, lower, violated.astype(np.int32))
-        return z
+            y = self._program.solve_sides(upper, lower, violated.astype(np.int32))
+        return None if y is None else self._z_per_y * y
 
     def _guess_ramps(self, upper: Array, lower: Array) -> Sense | None:
         """Guess the active rows: the setpoint moves from the last one to the regulator's at the slew limit.
