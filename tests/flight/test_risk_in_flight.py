@@ -39,6 +39,7 @@ def fly(
     silent: range = range(0),
     begins_m: Vec3 = (2.4, 0.0, -1.2),
     steps: int = STEPS,
+    period: int = 1,
 ) -> tuple[list[StepInput], list[TickOutput]]:
     """Fly from 0.5 m beside the target, or from another place, with runs of five lost positions in the mean.
 
@@ -46,6 +47,7 @@ def fly(
         ground_ticks: Ticks before the flight, with the same link.
         loss: Probability that a position is lost after one that came, and after one that was lost.
         silent: Ticks without any position.
+        period: Ticks from one position of the camera to the next.
     """
     controller, rng = build_controller(config), np.random.default_rng(seed)
     plant, state, inputs, outputs = controller.plant, make_initial_state(), [], []
@@ -54,7 +56,7 @@ def fly(
     for tick in range(ground_ticks + steps):
         at_ns = START_NS + tick * controller.tick_ns
         is_bad = bool(rng.random() < loss[is_bad])
-        if not is_bad and tick not in silent:
+        if not is_bad and tick not in silent and tick % period == 0:
             position = x[list(plant.position_index)] + rng.normal(scale=0.003, size=3)
             waiting.append(sample(at_ns + MS, at_ns + 40 * MS, tuple(position.tolist())))
         arrived = tuple(one for one in waiting if one.received_ns <= at_ns)
@@ -83,6 +85,11 @@ def test_a_replay_decides_the_same_with_the_same_risk(flight: tuple[list[StepInp
     inputs, outputs = flight
     assert run(build_controller(load_room()), inputs) == outputs
     assert len(list_risks(outputs)) > 0.9 * STEPS
+
+
+def test_a_slow_camera_shows_the_spread_too() -> None:
+    _, outputs = fly(load_room(), 4, loss=(0.0, 0.0), period=4)
+    assert 0.5 < list_risks(outputs)[-1].spread < 1.0
 
 
 def test_level_and_spread_follow_from_the_recorded_counts_alone(

@@ -44,8 +44,8 @@ from uavctl.smpc.nominal import ControlProblem, Lqr, Part, propagate_covariance
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Equilibria
 
-# Least weight of a stage: near limits a next plan costs more than the regulator. With 0.01 plans beside walls brake late
-# and cost a quarter more on an axis of a room; with 1 vehicles in rooms stay 1 to 3 cm further away
+# Least weight of a stage: near limits a next plan costs more than the regulator. With 0.01 plans beside walls brake
+# late, which costs a quarter more on an axis of a room; with 1 vehicles in rooms stay 1 to 3 cm further away
 MIN_STAGE_WEIGHT = 0.1
 # Largest budget of an age at the levels of observed links, as a multiple of the allowed risk: with old ages free, plans
 # in the rooms cost two thirds more at a wall
