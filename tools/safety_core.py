@@ -55,9 +55,9 @@ def what_is_not_run(tests: tuple[str, ...]) -> str:
     with tempfile.TemporaryDirectory() as folder:
         coverage = [sys.executable, "-m", "coverage"]
         data = f"--data-file={folder}/coverage"
+        pytest = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
         commands = (
-            [*coverage, "run", data, "--branch", f"--include={modules}"]
-            + ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *tests],
+            [*coverage, "run", data, "--branch", f"--include={modules}", *pytest],
             [*coverage, "report", data, "--show-missing", "--fail-under=100"],
         )
         for command in commands:
