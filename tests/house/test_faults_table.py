@@ -35,11 +35,12 @@ def find_marked_tests(source: str) -> list[tuple[int, str]]:
 
 @cache
 def read_rows() -> dict[int, tuple[str, str]]:
-    """Fault and reaction of each row, which begins with its number in bold."""
+    """Fault and reaction of each row; an item of the list begins with the numbers of its rows in bold."""
     text = PAGE.read_text(encoding="utf-8").replace("\n  ", " ")
-    rows = re.findall(r"^\* \*\*(\d+) (.+?)\*\* *(.*)$", text, re.MULTILINE)
-    assert len({row[0] for row in rows}) == len(rows), "a number twice"
-    return {int(number): (fault, reaction) for number, fault, reaction in rows}
+    items = re.findall(r"^\* \*\*((?:\d+, )*\d+) (.+?)\*\* *(.*)$", text, re.MULTILINE)
+    rows = [(int(number), fault, reaction) for numbers, fault, reaction in items for number in numbers.split(", ")]
+    assert len({number for number, *_ in rows}) == len(rows), "a number twice"
+    return {number: (fault, reaction) for number, fault, reaction in rows}
 
 
 def test_the_page_has_every_row_complete() -> None:
