@@ -410,8 +410,11 @@ def _modes(choice: ModeChoice) -> str:
 
 
 def _degrades() -> str:
-    """The modes of a person that a failsafe chooses as well, by autopilot; AUTO.EXTERNAL1 and its like as one."""
-    names = {name: sorted({mode.rstrip("0123456789") for mode in one.degraded_modes}) for name, one in PROFILES.items()}
+    """The modes of a person that a failsafe chooses as well, by autopilot; those that end in a number as one."""
+    names = {
+        name: sorted({re.sub(r"\d+$", "1 and so on", mode) for mode in profile.degraded_modes})
+        for name, profile in PROFILES.items()
+    }
     return "; ".join(f"{name}: {', '.join(modes)}" for name, modes in names.items())
 
 
