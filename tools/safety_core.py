@@ -33,7 +33,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "uavctl/flight/monitors/noise.py": ("tests/flight/test_position_noise.py",),
     "uavctl/flight/monitors/observation.py": ENVELOPE,
     "uavctl/flight/monitors/observer.py": ENVELOPE,
-    "uavctl/flight/monitors/outside.py": (*ENVELOPE, "tests/flight/test_response.py"),
+    "uavctl/flight/monitors/outside.py": ("tests/flight/test_envelope.py", "tests/flight/test_response.py"),
     "uavctl/flight/monitors/vehicle_velocity.py": ENVELOPE,
     "uavctl/flight/monitors/response.py": ("tests/flight/test_response.py",),
     "uavctl/flight/monitors/velocity.py": ENVELOPE,
