@@ -107,12 +107,14 @@ def fly_with_gaps(
     seed: int = 1,
     takes_off: bool = False,
     after_s: float = 5.0,
+    lands: bool = True,
 ) -> GapFlight:
     """Fly from wall to wall, and end the flight after that as the operator would.
 
     Args:
         takes_off: Whether it begins on the ground, by an order; else in the air, and the pilot has begun the flight.
         after_s: How long it goes on after the last gap [s].
+        lands: Whether it is ended; else it is looked at until then.
     """
     preset, duration_s = f"room-{autopilot}", gaps_s[-1][1] + after_s
     waypoints = _make_waypoints(preset, autopilot)
@@ -149,6 +151,8 @@ def fly_with_gaps(
 
     stopped.look = look
     world.run(duration_s, lambda: loop.finished)
+    if not lands:
+        return flight
     stopped.stop = True
     world.run(duration_s + LANDING_S, lambda: not world.peers.autopilot.pilot.is_armed)
     flight.is_down = not world.peers.autopilot.pilot.is_armed
