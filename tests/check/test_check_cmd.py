@@ -7,7 +7,6 @@ import os
 import socket
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import pytest
 from loopback_rig import MemorySink
 from patience import LIMIT_S
+from transport_rig import IdleConnection
 
 from logs.recording.info import read_info
 from logs.recording.parameters import ParameterReader
@@ -161,47 +161,19 @@ def test_no_room_and_no_folder_are_items(tmp_path: Path, monkeypatch: pytest.Mon
 # --- the runner, in virtual time ----------------------------------------------------------------
 
 
-class Wire:
+class Wire(IdleConnection):
     """A connection to simulated peers in virtual time."""
 
     def __init__(self, bench: Bench, name: str) -> None:
-        self.url, self.closed, self.send_errors, self.receive_errors = f"test://{name}", False, 0, 0
-        self.refused: Counter[str] = Counter()
+        super().__init__(name)
         self._bench, self._name = bench, name
-        self.answered = 0
-
-    has_known_sender, has_unread = True, False
-
-    def find_sender(self) -> tuple[int, None]:
-        return -1, None
-
-    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
-        return frame
-
-    def fileno(self) -> int:
-        return -1
-
-    def filenos(self) -> tuple[int, ...]:
-        return ()
-
-    def count_lost(self) -> int:
-        return 0
-
-    def trust_sender(self, index: int) -> None:
-        pass
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         taken, self._bench.arrived[self._name] = self._bench.arrived[self._name], []
         return taken
 
-    def select_peer(self, index: int) -> None:
-        self.answered += 1
-
     def send(self, data: bytes) -> None:
         self._bench.peers.receive(self._name, data, self._bench.now_ns)
-
-    def close(self) -> None:
-        self.closed = True
 
 
 class Bench:
@@ -230,7 +202,7 @@ def test_the_runner_is_bounded_and_answers_the_vehicle() -> None:
     bench = Bench()
     found = bench.run(4.0)
     assert bench.now_ns == pytest.approx(4.2e9, abs=2e8)
-    assert ItemState.BAD not in found.values() and bench.wires["vehicle"].answered > 3
+    assert ItemState.BAD not in found.values() and len(bench.wires["vehicle"].answered) > 3
 
 
 def test_it_waits_for_an_estimator_that_is_starting_but_not_for_ever() -> None:

@@ -14,6 +14,7 @@ from daemon_rig import DaemonRig, PeerConnection
 from loopback_rig import MemorySink, make_loop
 from mavlink_rig import Peer
 from signing_rig import EPOCH_S, KEY, OFFSET_NS, OTHER_KEY, SECOND, STAMP, SignedPeer, frames, make_signing, sign
+from transport_rig import IdleConnection
 
 from logs.recording.replay import replay
 from logs.recording.topics import encode
@@ -209,47 +210,17 @@ def test_a_recording_holds_no_key_and_no_signature_and_replays_without_them() ->
     assert any(isinstance(record, Refused) for _, _, record in entries)
 
 
-class Canned:
+class Canned(IdleConnection):
     """A connection on which some datagrams have arrived."""
 
-    url, closed, send_errors, receive_errors = "test://vehicle", False, 3, 4
+    send_errors, receive_errors = 3, 4
 
     def __init__(self, data: list[bytes]) -> None:
+        super().__init__("vehicle")
         self._data = data
-        self.refused: Counter[str] = Counter()
-        self.answered: list[int] = []
-
-    has_known_sender, has_unread = True, False
-
-    def find_sender(self) -> tuple[int, None]:
-        return -1, None
-
-    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
-        return frame
-
-    def fileno(self) -> int:
-        return -1
-
-    def filenos(self) -> tuple[int, ...]:
-        return ()
-
-    def count_lost(self) -> int:
-        return 0
-
-    def trust_sender(self, index: int) -> None:
-        pass
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         return [(data, n) for n, data in enumerate(self._data)]
-
-    def select_peer(self, index: int) -> None:
-        self.answered.append(index)
-
-    def send(self, data: bytes) -> None:
-        pass
-
-    def close(self) -> None:
-        self.closed = True
 
 
 def key_file(folder: Path) -> Path:

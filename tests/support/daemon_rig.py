@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from loopback_rig import MemorySink, shared_loop
 from sim_rig import decode
+from transport_rig import IdleConnection
 
 from sim.simulation import Peers
 from uavctl.clock import Ticker
@@ -68,49 +68,24 @@ class DaemonRig:
         )
 
 
-class PeerConnection:
+class PeerConnection(IdleConnection):
     """A connection to the simulated peers."""
 
     def __init__(self, bench: DaemonRig, name: str) -> None:
-        self.url, self.closed, self.send_errors, self.receive_errors = f"test://{name}", False, 0, 0
+        super().__init__(name)
         self._bench, self._name = bench, name
-        self.answered: list[int] = []
         self.sent: list[int] = []
         self.words: list[tuple[int, str]] = []  # what was sent, and when
         self.dropped = 0
-        self.refused: Counter[str] = Counter()
-
-    has_known_sender, has_unread = True, False
-
-    def find_sender(self) -> tuple[int, None]:
-        return -1, None
-
-    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
-        return frame
-
-    def fileno(self) -> int:
-        return -1
-
-    def filenos(self) -> tuple[int, ...]:
-        return ()
 
     def count_lost(self) -> int:
         return self.dropped
-
-    def trust_sender(self, index: int) -> None:
-        pass
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         taken, self._bench.arrived[self._name] = self._bench.arrived[self._name], []
         return taken
 
-    def select_peer(self, index: int) -> None:
-        self.answered.append(index)
-
     def send(self, data: bytes) -> None:
         self.sent.append(self._bench.now_ns)
         self.words += [(self._bench.now_ns, message.get_type()) for message in decode(data)]
         self._bench.peers.receive(self._name, data, self._bench.now_ns)
-
-    def close(self) -> None:
-        self.closed = True

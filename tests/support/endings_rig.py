@@ -11,7 +11,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ import pytest
 from patience import LIMIT_S
 from recording_fakes import Disk
 from sim_rig import decode
+from transport_rig import IdleConnection
 
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
@@ -54,37 +54,13 @@ TAKE_OFF = ("--arm", "--takeoff", "1.2")
 Step = tuple[Callable[["EndingRig"], bool], Callable[["EndingRig"], None]]
 
 
-class PeerConnection:
+class PeerConnection(IdleConnection):
     """A connection to the simulated peers."""
 
-    has_known_sender, has_unread, send_errors, receive_errors = True, False, 0, 0
-
     def __init__(self, rig: EndingRig, name: str) -> None:
-        self.url, self.closed = f"test://{name}", False
+        super().__init__(name)
         self._rig, self._name = rig, name
         self.arrived: list[tuple[bytes, int]] = []
-        self.refused: Counter[str] = Counter()
-
-    def find_sender(self) -> tuple[int, None]:
-        return -1, None
-
-    def encode_ahead(self, frame: bytes, ahead_ns: int) -> bytes:
-        return frame
-
-    def fileno(self) -> int:
-        return -1
-
-    def filenos(self) -> tuple[int, ...]:
-        return ()
-
-    def count_lost(self) -> int:
-        return 0
-
-    def trust_sender(self, index: int) -> None:
-        pass
-
-    def select_peer(self, index: int) -> None:
-        pass
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         taken, self.arrived = self.arrived, []
@@ -94,9 +70,6 @@ class PeerConnection:
         self._rig.sent.append((self._rig.now_ns, data))
         if self._rig.is_delivered(data):
             self._rig.peers.receive(self._name, data, self._rig.now_ns)
-
-    def close(self) -> None:
-        self.closed = True
 
 
 class DiskRecorder(SyncRecorder):
