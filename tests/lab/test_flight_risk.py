@@ -54,7 +54,7 @@ def make_adrift(rehearsals: int) -> Config:
             "sets.input_upper=[1e-6,1e-6,1e-6]",
             "sim.start_position_m=[2.99,0,-1.2]",
             "target.position_m=[2.99,0,-1.2]",
-            "duration_s=3",
+            "duration_s=2",
             f"check.rehearsals={rehearsals}",
         ),
     )

@@ -17,6 +17,8 @@ from uavctl.records import Decision, Estimate, Event, Header, Plan, Record, Trut
 def test_it_shows_what_the_records_say() -> None:
     """At each decision of a recorded flight, beside the records themselves."""
     seen, newest, shown = FlightScene(), dict[type[Record], Any](), 0
+    (header,) = fly_view().of(Header)
+    design, title = read_design(header), f"uavctl: {parse(header.config_toml, 'flight').config.name}"
     for _, _, record in fly_view().entries:
         seen.add_record(record)
         newest[type(record)] = record
@@ -24,9 +26,8 @@ def test_it_shows_what_the_records_say() -> None:
             continue
         found = seen.scene()
         assert found is not None
-        header, estimate, truth = newest[Header], newest.get(Estimate), newest.get(Truth)
-        design = read_design(header)
-        assert found.title == f"uavctl: {parse(header.config_toml, 'flight').config.name}"
+        estimate, truth = newest.get(Estimate), newest.get(Truth)
+        assert found.title == title
         places = {body.name: body.at_m for body in found.bodies}
         assert found.time_s == pytest.approx((record.at_ns - header.started_ns) * 1e-9)
         assert found.age_s == (None if estimate is None else pytest.approx(estimate.age_s))

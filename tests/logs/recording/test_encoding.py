@@ -86,12 +86,11 @@ def make_plan(rows: Matrix) -> Plan:
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False).filter(lambda one: one == 0.0 or 1e-9 < abs(one) < 1e15)
 
 
-@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=4), values(Plan))
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=4))
 def test_a_recorded_plan_has_four_digits_of_each_number_and_the_checksum_of_all_bits(
-    rows: list[tuple[float, float]], plan: Plan
+    rows: list[tuple[float, float]],
 ) -> None:
-    exact = msgspec.structs.replace(plan, exact_crc32=None, **dict.fromkeys(MATRICES, np.array(rows)))
-    found = round_plan(exact)
+    found = round_plan(make_plan(tuple(rows)))
     numbers = [number for row in rows for number in row]
     assert found.exact_crc32 == zlib.crc32(4 * struct.pack(f"={len(numbers)}d", *numbers))
     assert all(getattr(found, name).tolist() == found.states.tolist() for name in MATRICES)
