@@ -31,6 +31,8 @@ from uavctl.config.load import dump_config, parse
 from uavctl.errors import UsageError
 from uavctl.lab.tune.excitation import parse_box
 
+# An ArduPilot here, a PX4 in test_tune_real.py.
+OURS = ("--set", "log.segment_bytes=1000000", "--set", "sim.autopilot=ardupilot")
 PILOT = 'sim.fault=[{at_s=6.0,kind="mode",name="POSCTL"}]'
 
 
@@ -39,7 +41,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole run, its recordings in several files."""
     folder = tmp_path_factory.mktemp("tune") / "run"
     with short_flights():
-        assert run(make_arguments(folder, "--set", "log.segment_bytes=1000000")) == 0
+        assert run(make_arguments(folder, *OURS)) == 0
     return folder
 
 
@@ -53,7 +55,7 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "begun"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tune_run, "fly_once", pressed)
-        assert run(make_arguments(folder, "--set", "log.segment_bytes=1000000")) == TuneExit.INTERRUPTED
+        assert run(make_arguments(folder, *OURS)) == TuneExit.INTERRUPTED
     monkeypatch.setattr(tune_run, "fly_once", lambda *_, **__: pytest.fail("flown"))
     return folder
 
@@ -66,7 +68,7 @@ def no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
 def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, str]:
     """The same command on a folder."""
     with short_flights():
-        return run_command(capsys, *make_arguments(folder, "--set", "log.segment_bytes=1000000", "--json"))
+        return run_command(capsys, *make_arguments(folder, *OURS, "--json"))
 
 
 @pytest.mark.slow
@@ -133,7 +135,7 @@ def test_another_configuration_is_refused_by_its_key(begun: Path, capsys: pytest
 def test_another_box_is_refused(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--box=-1.1,-1.1,-2,1.2,1.1,-0.4" if one == BOX else one for one in make_arguments(begun)]
     with short_flights():
-        code, _, err = run_command(capsys, *arguments, "--set", "log.segment_bytes=1000000")
+        code, _, err = run_command(capsys, *arguments, *OURS)
     assert code == 2 and "fence" in err
 
 
@@ -192,7 +194,7 @@ def test_a_recording_takes_the_place_of_the_first_flight(
 
     monkeypatch.setattr(tune_run, "fly_once", pressed)
     arguments = ["tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback", "--set", START]
-    code, out, _ = run_command(capsys, *arguments, "--json")
+    code, out, _ = run_command(capsys, *arguments, *OURS, "--json")
     assert code == TuneExit.INTERRUPTED
     document = json.loads(out)
     assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED_FILE)
@@ -314,15 +316,3 @@ def test_corners_in_any_order_are_one_box() -> None:
     boxes = [parse_box(text) for text in ("-1,-2,-3,1,2,-0.4", "1,2,-0.4,-1,-2,-3", "1,-2,-0.4,-1,2,-3")]
     assert boxes[0] == boxes[1] == boxes[2]
     assert boxes[0].lower == (-1.0, -2.0, -3.0) and boxes[0].upper == (1.0, 2.0, -0.4)
-
-
-@pytest.mark.slow
-def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "run"
-    with short_flights():
-        code, out, _ = run_command(capsys, *make_arguments(folder, "--set", "sim.autopilot=ardupilot", "--json"))
-    document = json.loads(out)
-    assert (code, document["stopped"]) == (0, "")
-    first, second = document["figures"]
-    old_m, new_m = document["prediction_m"]
-    assert first["beyond_box_m"] < 0.0 and second["beyond_box_m"] < 0.0 and new_m < 0.7 * old_m
