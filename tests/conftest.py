@@ -86,11 +86,12 @@ def control_may_fail() -> None:
     """For tests of what happens when the controller, or what is beside it, fails."""
 
 
-@pytest.fixture(autouse=True)
-def _pages_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="session", autouse=True)
+def _pages_are_drawn_here() -> Iterator[None]:
     """Here, and without their figures, at which tests/logs/report looks: tests of flights read what a page says.
 
-    A process for each would load matplotlib again and again; test_loopback.py draws one as it is.
+    A process for each would load matplotlib again and again; test_loopback.py draws one as it is. For the session, so
+    that the flights of fixtures have theirs drawn here, too.
     """
 
     def draw(path: Path, summary: FlightSummary, page: Path) -> None:
@@ -103,7 +104,9 @@ def _pages_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
         with omit_figures():
             write_report(FlightData.from_records(read(path), path), summary, page)
 
-    monkeypatch.setattr("uavctl.cli.flying.draw_page", draw)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uavctl.cli.flying.draw_page", draw)
+        yield
 
 
 @pytest.fixture
