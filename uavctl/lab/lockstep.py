@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from logs.recording.ends import put_header
-from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
+from logs.recording.recorder import BatchRecorder, DerivedTopics, RecorderStatus
 from logs.recording.topics import ENDED
 from logs.recording.views import ViewBuilder
 from sim.simulation import World
@@ -79,7 +79,7 @@ class LockstepFlight:
 
     def __init__(self, prepared: Prepared, path: Path, command: str | None = None) -> None:
         self._prepared, self._command = prepared, command
-        self._recorder = SyncRecorder(path, prepared.config.log, derived_topics=DerivedTopics(ViewBuilder()))
+        self._recorder = BatchRecorder(path, prepared.config.log, derived_topics=DerivedTopics(ViewBuilder()))
         self.loop = ControlLoop(prepared.config, prepared.controller, self._recorder, time.perf_counter_ns)
         self._at_ns = 0
         self.wall_s = 0.0
