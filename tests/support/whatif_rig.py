@@ -10,9 +10,9 @@ from loopback_rig import MemorySink, header, lockstep, share_flight
 from uavctl.config import Config, load_config
 from uavctl.lab.whatif.flight import (
     Entry,
-    OtherLink,
     RecordedFlight,
     ReflownFlight,
+    SimulatedLink,
     make_recorded_flight,
     make_response,
     refly,
@@ -45,7 +45,7 @@ def history(case: Case) -> RecordedFlight:
     return make_recorded_flight(fly_case(case).entries, load_case_config(case), "recording")
 
 
-def fly_again(case: Case, *changes: str, other_link: OtherLink | None = None) -> tuple[MemorySink, ReflownFlight]:
+def fly_again(case: Case, *changes: str, other_link: SimulatedLink | None = None) -> tuple[MemorySink, ReflownFlight]:
     config, memory = load_case_config(case, *changes), MemorySink()
     design, controller = share_flight(config)
     memory.put("/uavctl/header", 0, header(config, design))

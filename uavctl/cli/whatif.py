@@ -58,7 +58,6 @@ from uavctl.lab.whatif.comparison import (
 from uavctl.lab.whatif.flight import (
     Entry,
     EntryObserver,
-    OtherLink,
     RecordedFlight,
     ReflownFlight,
     SimulatedLink,
@@ -302,7 +301,7 @@ def _record_changed(
     history: RecordedFlight,
     changed_controller: Prepared,
     response: VehicleResponse,
-    other_link: OtherLink | None,
+    other_link: SimulatedLink | None,
     path: Path,
     recorded: Header,
     watch: EntryObserver,

@@ -34,7 +34,7 @@ from uavctl.flight.mission import MissionState, advance_mission, find_limits, ma
 from uavctl.flight.risk import charge_step, set_risk
 from uavctl.flight.risk_state import RiskGroup
 from uavctl.lab.campaign.arrivals import compute_known_steps, select_newest_captures
-from uavctl.lab.campaign.draws import draw, draw_noise
+from uavctl.lab.campaign.draws import Stream, compute_root, draw, draw_normal
 from uavctl.lab.campaign.position_filter import FilterBelief, PositionFilter
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Preview
@@ -45,7 +45,6 @@ from uavctl.wiring.controller import build_estimator
 from uavctl.wiring.rehearsal import MAX_STEPS, make_rehearsal_start
 
 CONFIDENCE = 0.95  # of the bound of the probability
-_INERTIAL = 4  # child of a run's seed: 0 to 3 are those of `uavctl.lab.campaign.draws`
 _SPREAD = 1.0  # v: disturbances are those of the model
 _ROUNDING_M = 1e-9  # beyond a limit by less is rounding
 
@@ -145,23 +144,17 @@ class _Draws:
 
 
 def _draw(config: Config, plant: Plant, flights: int, steps: int, seed: int) -> _Draws:
-    draws, axes, estimator = draw(seed, 0, flights, steps, plant.n_w), len(plant.axes), config.estimator
-    values, vectors = np.linalg.eigh(plant.w)
+    draws, shape, estimator = draw(seed, 0, flights, steps, plant.n_w), (steps, len(plant.axes)), config.estimator
+    slow, white = np.moveaxis(draw_normal(Stream.INERTIAL, seed, 0, flights, (2, *shape)), 1, 0)
     # b(k+1) = φ b(k) + √(1 - φ²) σ n(k), φ = exp(-Δt/T), b(0) ~ N(0, σ²)
     kept = math.exp(-plant.dt_s / estimator.inertial_bias_s)
-    errors = np.empty((flights, steps, axes))
-    for i in range(flights):
-        child = np.random.SeedSequence([seed, i]).spawn(_INERTIAL + 1)[_INERTIAL]
-        normal = np.random.default_rng(child).standard_normal((2, steps, axes))
-        slow = normal[0]
-        for k in range(1, steps):
-            slow[k] = kept * slow[k - 1] + math.sqrt(1.0 - kept**2) * slow[k]
-        errors[i] = estimator.inertial_bias_mps2 * slow + estimator.inertial_std_mps2 * normal[1]
+    for k in range(1, steps):
+        slow[:, k] = kept * slow[:, k - 1] + math.sqrt(1.0 - kept**2) * slow[:, k]
     return _Draws(
-        disturbances=draws.normal @ ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T),
+        disturbances=draws.normal @ compute_root(plant.w),
         known_steps=compute_known_steps(config.link, plant.dt_s, draws.link),
-        position_noise_m=estimator.position_std_m * draw_noise(seed, 0, flights, steps, axes),
-        inertial_errors_mps2=errors,
+        position_noise_m=estimator.position_std_m * draw_normal(Stream.POSITION_NOISE, seed, 0, flights, shape),
+        inertial_errors_mps2=estimator.inertial_bias_mps2 * slow + estimator.inertial_std_mps2 * white,
     )
 
 

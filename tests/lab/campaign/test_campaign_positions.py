@@ -18,7 +18,7 @@ from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, 
 from uavctl.flight.kalman import make_kalman
 from uavctl.lab.campaign.arrivals import compute_known_steps, select_newest_captures
 from uavctl.lab.campaign.controllers import draw_conditions, make_filter_belief
-from uavctl.lab.campaign.draws import draw, draw_noise
+from uavctl.lab.campaign.draws import Stream, draw, draw_normal
 from uavctl.lab.campaign.pool import Columns
 from uavctl.lab.campaign.position_filter import PositionFilter
 from uavctl.lab.campaign.tasks import Cell, fly_task, make_tasks
@@ -110,7 +110,7 @@ def test_errors_and_prediction_errors_have_the_covariance_of_the_filter() -> Non
     index = list(plant.position_index)
     state = np.zeros((runs, steps + 1, plant.n_x))
     state[:, 0] = 2.0 * rng.normal(size=(runs, plant.n_x))
-    noise = 0.3 * draw_noise(2, 0, runs, steps, 2)
+    noise = 0.3 * draw_normal(Stream.POSITION_NOISE, 2, 0, runs, (steps, 2))
     inputs = rng.normal(size=(runs, steps, plant.n_u))
     pushes = chances.normal @ np.linalg.cholesky(plant.w).T
     for k in range(steps):
@@ -137,7 +137,10 @@ def test_an_exact_state_s_prediction_has_no_covariance_of_its_own() -> None:
 
 
 def test_noise_is_independent_of_other_draws_and_longer_runs_begin_alike() -> None:
-    noise, single = draw_noise(7, 10, 5, 20, 2), draw_noise(7, 13, 1, 30, 2)
+    noise, single = (
+        draw_normal(Stream.POSITION_NOISE, 7, first, runs, (steps, 2))
+        for first, runs, steps in ((10, 5, 20), (13, 1, 30))
+    )
     assert np.array_equal(noise[3], single[0, :20])
     assert abs(np.corrcoef(noise.ravel(), draw(7, 10, 5, 20, 2).normal.ravel())[0, 1]) < 0.3
 

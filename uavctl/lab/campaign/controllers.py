@@ -23,7 +23,7 @@ from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
 from uavctl.lab.campaign.arrivals import compute_known_steps, select_newest_captures
-from uavctl.lab.campaign.draws import draw, draw_noise
+from uavctl.lab.campaign.draws import Stream, compute_root, draw, draw_normal, draw_uniform
 from uavctl.lab.campaign.position_filter import FilterBelief
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, make_controller
 from uavctl.lab.campaign.world import LinearWorld
@@ -60,9 +60,7 @@ def shape_disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
         w: W (n_w, n_w).
         normal: Standard normal draws (N, T, n_w), see `RandomDraws.normal`.
     """
-    values, vectors = np.linalg.eigh(w)
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T  # the symmetric one, which is unique
-    shaped = spec.scale * _shape_draws(spec, normal) @ root
+    shaped = spec.scale * _shape_draws(spec, normal) @ compute_root(w)
     return np.asarray(shaped + spec.bias * np.sqrt(np.diag(w)), dtype=np.float64)
 
 
@@ -82,9 +80,6 @@ def _shape_draws(spec: DisturbanceSpec, normal: Array) -> Array:
             gusts[:, k] = spec.memory * gusts[:, k - 1] + np.sqrt(1.0 - spec.memory**2) * normal[:, k]
         return gusts
     return normal
-
-
-_START_CHILD = 2  # child of a run's seed that draws its start; 0 and 1 are those of `draws.draw`
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +127,7 @@ def draw_conditions(setting: CellSetting, first: int, runs: int) -> RunCondition
     noise = None
     if spec.measured == "position":
         std_m = setting.base.sim.camera.noise_std_m
-        noise = std_m * draw_noise(spec.master, first, runs, spec.steps, len(plant.axes))
+        noise = std_m * draw_normal(Stream.POSITION_NOISE, spec.master, first, runs, (spec.steps, len(plant.axes)))
     return RunConditions(
         world,
         select_newest_captures(known_steps),
@@ -158,10 +153,7 @@ def _draw_start_states(setting: CellSetting, first: int, runs: int) -> Array:
     if not spec.start_box:
         return np.tile(get_start_state(spec, setting.base), (runs, 1))
     lower, upper = np.array(spec.start_box, dtype=np.float64)
-    draws = np.empty((runs, lower.size))
-    for i in range(runs):
-        seed = np.random.SeedSequence([spec.master, first + i]).spawn(_START_CHILD + 1)[_START_CHILD]
-        np.random.default_rng(seed).random(out=draws[i])
+    draws = draw_uniform(Stream.START, spec.master, first, runs, (lower.size,))
     return np.asarray(lower + (upper - lower) * draws, dtype=np.float64)
 
 

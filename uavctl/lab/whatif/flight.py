@@ -14,7 +14,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -238,19 +238,6 @@ EntryObserver = Callable[[Iterable[Entry]], Iterable[Entry]]
 """Passes on the entries of a recording, for a progress bar."""
 
 
-class OtherLink(Protocol):
-    """Interface of a link that carries the positions in place of the recorded one."""
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Positions sent so far, and how many of them were lost."""
-        ...
-
-    def pop_due(self, to_ns: int, deviation: Deviation) -> list[tuple[int, bytes]]:
-        """Return the datagrams that arrive up to and including `to_ns`, as (arrival [ns], bytes)."""
-        ...
-
-
 @dataclass
 class ReflownFlight:
     """Result of flying a recording again."""
@@ -269,7 +256,7 @@ def refly(
     response: VehicleResponse,
     sink: Sink,
     stopwatch: Callable[[], int],
-    other: OtherLink | None = None,
+    other: SimulatedLink | None = None,
     watch: EntryObserver = iter,
 ) -> ReflownFlight:
     """Fly a recorded flight again, with something changed.
@@ -323,7 +310,7 @@ class _ReflownLoop:
         loop: ControlLoop,
         tap: _SetpointTap,
         course: ReflownFlight,
-        other: OtherLink | None,
+        other: SimulatedLink | None,
     ) -> None:
         self._history, self._loop, self._tap, self._other = history, loop, tap, other
         self.course = course
@@ -459,7 +446,7 @@ class Capture:
 
 
 class SimulatedLink:
-    """Positions of a recording over a simulated link; implements `OtherLink`.
+    """Link that carries the positions of a recording in place of the recorded one.
 
     Args:
         seed: Seed of the losses, and of the noise of positions that the recording lacks.
@@ -484,7 +471,7 @@ class SimulatedLink:
         return self._channel.counters.sent, self._channel.counters.lost
 
     def pop_due(self, to_ns: int, deviation: Deviation) -> list[tuple[int, bytes]]:
-        """See `OtherLink`."""
+        """Return the datagrams that arrive up to and including `to_ns`, as (arrival [ns], bytes)."""
         while self._captures and self._captures[0].at_ns <= to_ns:
             capture = self._captures.popleft()
             offset_m = _add(capture.offset_m, deviation.get_position_m(capture.at_ns))
