@@ -78,7 +78,7 @@ def test_lasting_lies_of_inertial_data_alone_do_not_brake_at_every_lost_position
     flight, blackout_s = fly_lies(seed, "quadrotor", (("inertial", kind, BLACKOUT_S - 0.3),))
     assert flight.modes is not None
     later = [mode for at_s, mode in flight.modes if at_s > blackout_s + BLACKOUT_S + 1.5]
-    assert ControlMode.BRAKE not in later and flight.modes[-1][1] is ControlMode.TRACK
+    assert later.count(ControlMode.BRAKE) <= 1 and flight.modes[-1][1] is ControlMode.TRACK
     assert flight.outside_m <= OUTSIDE_M
 
 

@@ -172,7 +172,7 @@ def test_flights_of_the_simulator_leave_as_often(budgets: str) -> None:
     if budgets == "configured":
         assert risk.left > 0 and left > 0
     else:
-        assert risk.steps_outside < 0.001 * risk.flights * risk.steps
+        assert risk.steps_outside < 0.1 * risk.step_risk * risk.flights * risk.steps
     assert_allclose(risk.beyond_m, beyond_m, atol=0.1)
     assert fisher_exact(np.array([[left, flights - left], [risk.left, risk.flights - risk.left]])).pvalue > 0.01
 

@@ -174,6 +174,7 @@ class ConditionedSolver:
         # Margins of all rows minus their back-offs, and the view of the state rows (H, m)
         self._margins = np.full(width * steps + hard + 1, OPEN)
         self._margins_x = self._margins[: width * steps].reshape(steps, width)
+        self._equal_weights = np.ones(steps)
         self._used_margin = np.zeros((steps, width))  # margin of state rows that all parts use so far
         self._levels = RiskLevels(
             problem,
@@ -236,8 +237,6 @@ class ConditionedSolver:
         if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         rest = self._find_rest(target, preview)
-        for program in self._parts:
-            program.weigh_stages(rest.allocation.weights)
         reference, equilibrium_input = rest.reference, rest.equilibrium_input
         row_backoffs = self._find_row_backoffs(rest.allocation, preview)
         first = (
@@ -255,6 +254,7 @@ class ConditionedSolver:
             given_z = [(program, shift[ages].ravel()) for program, shift in rest.shifts]
         for program, z in given_z:
             program.subtract_margin(z, margin_x, hard)
+        self._weigh_stages(rest.allocation, margin_x, hard)
         result = self._allocate_rows(margin_x, hard, row_backoffs)
         if result is None:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
@@ -289,6 +289,19 @@ class ConditionedSolver:
             iterations=result.iterations,
             relaxed=relaxed,
         )
+
+    def _weigh_stages(self, allocation: Allocation, margin: Array, hard: Array) -> None:
+        """Select the weights of the stages for each part.
+
+        A new position frees a plan from back-offs, but not from limits that the regulator's own mean would break.
+
+        Args:
+            margin: Margin of the state rows for z = 0 (H, m).
+            hard: Margin of the hard rows for z = 0.
+        """
+        for program in self._parts:
+            is_free = (margin[:, program.columns] >= 0.0).all() and (hard[program.hard] >= 0.0).all()
+            program.weigh_stages(allocation.weights if is_free else self._equal_weights)
 
     def _find_rest(self, target: Array, preview: Preview) -> _Rest:
         """Find where a plan rests; that of the last target is kept, by its bits, without limits or a path."""
