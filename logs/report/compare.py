@@ -49,7 +49,7 @@ class LoadedFlight:
     identity: ComparedFlight
     flight: FlightData
     summary: FlightSummary
-    parameters: Mapping[str, VehicleParameter]  # of the vehicle, as it told them
+    parameters: Mapping[str, VehicleParameter]  # of the vehicle, as it reported them
 
 
 def load_flights(
@@ -330,7 +330,7 @@ def _collect_parameters(recording: LoadedFlight) -> dict[str, object]:
 
 
 def _collect_vehicle_parameters(recordings: Sequence[LoadedFlight]) -> list[dict[str, object]]:
-    """Return the vehicle's parameters that differ, of those told in all flights in which it told any."""
+    """Return the vehicle's parameters that differ, of those reported in all flights with any."""
     parameter_sets = [recording.parameters for recording in recordings if recording.parameters]
     common_names = sorted(set.intersection(*map(set, parameter_sets))) if parameter_sets else []
     differing_names = [
@@ -353,7 +353,7 @@ def _list_notes(recordings: Sequence[LoadedFlight]) -> Iterator[str]:
     if _differs(recordings, lambda recording: recording.parameters.keys()):
         counts_text = ", ".join(f"{recording.identity.name} {len(recording.parameters)}" for recording in recordings)
         yield (
-            f"the vehicle did not tell the same parameters in all ({counts_text}): those that only some have are "
+            f"the vehicle did not report the same parameters in all ({counts_text}): those of some flights only are "
             f"left out"
         )
     for recording in recordings:

@@ -31,7 +31,7 @@ def write_comparison_page(comparison: FlightComparison, recordings: Sequence[Loa
 
     Raises:
         RecordingError: The file cannot be written.
-        UsageError: More flights than can be told apart in one drawing, or `path` is that of a recording.
+        UsageError: More flights than can be distinguished in one drawing, or `path` is that of a recording.
     """
     refuse_recording_path(path)
     if len(recordings) > len(overlays.ROLES):

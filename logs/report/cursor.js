@@ -33,7 +33,7 @@
   for (const view in flight.views) {
     for (const svg of document.querySelectorAll(`svg[data-${view}]`)) {
       const [x0, x1, left, right, y0, y1, low, high] = svg.dataset[view].split(" ").map(Number);
-      for (const [kind, rows] of [["believed", flight.believed], ["true", flight.course]]) {
+      for (const [kind, rows] of [["estimated", flight.estimated], ["true", flight.course]]) {
         const dot = add(svg, "circle", {class: "moment " + kind, r: kind === "true" ? 4.2 : 5.6});
         movers.push(t => {
           const p = place(rows, t);
@@ -64,7 +64,7 @@
   });
   const output = add(bar, "output", {});
   const show = () => {
-    const t = Number(input.value), p = place(flight.course, t), q = place(flight.believed, t);
+    const t = Number(input.value), p = place(flight.course, t), q = place(flight.estimated, t);
     for (const move of movers) move(t);
     const off = p && q ? Math.hypot(p[0] - q[0], p[1] - q[1], p[2] - q[2]) : 0;
     const parts = [`${t.toFixed(1)} s`, said(t)];

@@ -21,7 +21,7 @@ def render_cursor_script(flight: FlightData, at_s: float) -> str:
     """Return the script of a flight's page, which shows the moment `at_s` [s] first."""
     design = flight.design
     estimates = select_trusted_estimates(flight)
-    believed_m = np.array([design.position_of(estimate.mean) for estimate in estimates]).reshape(-1, 3)
+    estimated_m = np.array([design.position_of(estimate.mean) for estimate in estimates]).reshape(-1, 3)
     course_m = np.array([truth.position_m for truth in flight.truths]).reshape(-1, 3)
     modes = [next(group) for _, group in groupby(flight.decisions, key=lambda decision: decision.mode)]
     data = {
@@ -30,7 +30,7 @@ def render_cursor_script(flight: FlightData, at_s: float) -> str:
         "at_s": round(at_s, 3),
         "views": {name: matrix.tolist() for name, (_, matrix) in VIEWS.items()},
         "course": _make_rows(flight.seconds([truth.at_ns for truth in flight.truths]), course_m),
-        "believed": _make_rows(flight.seconds([estimate.at_ns for estimate in estimates]), believed_m),
+        "estimated": _make_rows(flight.seconds([estimate.at_ns for estimate in estimates]), estimated_m),
         "modes": [(round((mode.at_ns - flight.origin_ns) * 1e-9, 3), mode.mode) for mode in modes],
         "fences": _list_moving_limits(flight),
     }

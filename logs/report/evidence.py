@@ -21,13 +21,13 @@ from uavctl.config import Config
 from uavctl.records import Decision, LinkStats
 from uavctl.wiring.controller import build_estimator
 
-_PUSH_MPS2, _PUSH_MPS = 0.1, 0.3  # carries a vehicle off by as much as is worth telling, if it lasts
+_PUSH_MPS2, _PUSH_MPS = 0.1, 0.3  # carries a vehicle off by as much as is worth reporting, if it lasts
 _MIN_OBSERVATION_S, _MAX_EXIT_DELAY_S = (
     0.3,
     3.0,
-)  # least time to tell a push in, and the longest until a limit is left for it
+)  # least time to detect a push in, and the longest until a limit is left for it
 
-MIN_STALL_S = 0.5  # between two ticks: the process stood still, and heard nothing
+MIN_STALL_S = 0.5  # between two ticks: the process did not run or receive
 HEARTBEAT_S = 1.0  # between two heartbeats
 
 
@@ -122,10 +122,10 @@ class FlightEvidence:
         return sum(count for _, count in refusals), refusals[0][0] if refusals else np.inf
 
     def estimate_push(self, excursion: Excursion) -> Push | None:
-        """Return what pushed it outwards beside the setpoints, by the true velocity and the setpoints that were sent.
+        """Return the push outwards that no setpoint explains, by the true velocity and the sent setpoints.
 
         Looked at from the last position on, or over the last second at least, while setpoints flew it. None where the
-        truth is unknown, too little was flown, or nothing worth telling pushed.
+        truth is unknown, too little was flown, or no significant push was found.
         """
         flight = self.flight
         spans = [(begin, end) for begin, end in flight.spans(FLOWN) if begin < excursion.worst_s]
@@ -156,7 +156,7 @@ class FlightEvidence:
     def compute_age_s(self, at_s: float) -> float:
         """Return how long ago the newest position was captured [s]; 0 before the first.
 
-        The estimate tells, up to a breach of the envelope: then it takes back positions that did come.
+        By the estimate, up to a breach of the envelope: then it rolls back positions that did come.
         """
         index = int(np.searchsorted(self.estimate_s, at_s + 1e-6, side="right")) - 1
         if index < 0:

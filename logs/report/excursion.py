@@ -134,7 +134,7 @@ def _find_runs(outside: Flags, t_s: Array) -> list[tuple[int, int]]:
 
 
 def select_trusted_estimates(flight: FlightData) -> tuple[Estimate, ...]:
-    """Return the estimates that say where the vehicle is: those with a position that plans still reach from."""
+    """Return the estimates with a position recent enough for plans."""
     reach_s = flight.design.horizon * flight.design.dt_s
     return tuple(estimate for estimate in flight.estimates if estimate.age_s <= reach_s)
 

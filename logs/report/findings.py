@@ -31,7 +31,7 @@ _EFFECTS = frozenset({CauseRank.LOST, CauseRank.FAILSAFE, CauseRank.TAKEN_OVER, 
 
 @dataclass(frozen=True)
 class Finding:
-    """One cause that a recording shows, told from the moment on at which it began."""
+    """One cause that a recording shows, with the time at which it began."""
 
     cause: Cause
     at_s: float
@@ -50,7 +50,7 @@ class Banner:
     """First line of a page: what matters most, in colour and words, and the sentences below it."""
 
     tone: str  # GOOD, CAUTION or BAD
-    word: str  # result in a few words, so that it is said without colour too
+    word: str  # result in a few words, so that it is readable without colour
     text: str  # the rest of the line
     reasons: tuple[str, ...] = ()
 
@@ -116,7 +116,7 @@ def make_headline(findings: Iterable[Finding], outcome: str = "", reasons: Itera
 
 
 def _is_in_outcome(finding: Finding, outcome: str) -> bool:
-    """Return whether the line itself says how the flight ended."""
+    """Return whether the headline contains how the flight ended."""
     return bool(outcome) and finding.cause is Cause.NOT_AS_ORDERED
 
 

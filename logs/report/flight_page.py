@@ -32,9 +32,9 @@ _TARGET = Mark("dotted", "target", "target")
 _LIMIT = Mark("dashed", "limit", "limit")
 _FALLBACK = Mark("band", "fallback", "fallback", when=lambda e: e.flight.fallback_spans)
 _HORIZON = Mark("dotted", "muted", "horizon H")
-_NO_PLAN = "No plan was flown, so there is nothing to compare."
+_NO_PLAN = "No plan was flown."
 
-# Of these every other text is another matter: what the vehicle says, who flies.
+# Events of which each distinct text gets a row of its own: texts of the vehicle, changes of control.
 _VERBATIM_EVENTS = frozenset({EventCode.VEHICLE_TEXT, EventCode.COMMAND_ACK, EventCode.HAND_OVER})
 
 
@@ -80,7 +80,7 @@ def _draw_ages(e: FlightEvidence) -> Iterator[Part]:
 
 def _explain_age(e: FlightEvidence) -> str:
     return (
-        f"How many steps old the newest position was. A plan lasts H = {e.flight.design.horizon} steps; at age H the "
+        f"The age of the newest position, in steps. A plan lasts H = {e.flight.design.horizon} steps; at age H the "
         "fallback takes over."
     )
 
@@ -92,17 +92,19 @@ def _show_link(e: FlightEvidence) -> Iterator[Part]:
 
 
 def _explain_link(e: FlightEvidence) -> str:
-    """Return how to read the link's figures; delays are short of the truth where only the quickest one is known."""
-    note = "The dashed line is what the design counts on, by the link of the configuration."
+    """Return how to read the link's figures; delays are relative where only the quickest one is known."""
+    note = "The dashed line shows the design's assumption, from the link of the configuration."
     delay = e.judged.verdicts.link.delay
     if delay is None or not delay.from_quickest:
         return note
     if delay.latency_ms:
         return (
-            f"{note} The shortest delay is taken to be {format_number(delay.latency_ms)} ms (clock.latency_s), as the "
-            "sender's clock is only known by it."
+            f"{note} The shortest delay is assumed to be {format_number(delay.latency_ms)} ms (clock.latency_s): the "
+            "sender's clock is only known from the quickest arrivals."
         )
-    return f"{note} Delays are short of the quickest one, as the sender's clock is only known by it."
+    return (
+        f"{note} Delays are relative to the quickest one: the sender's clock is only known from the quickest arrivals."
+    )
 
 
 def _draw_plans(e: FlightEvidence) -> Iterator[Part]:
@@ -112,13 +114,14 @@ def _draw_plans(e: FlightEvidence) -> Iterator[Part]:
 
 def _explain_certificates(e: FlightEvidence) -> str:
     slack_text = (
-        "Slack is what state limits gave way by (light); the rest at the end of a plan may be missed, too (dark)."
+        "Slack is the amount by which state limits were relaxed (light). A plan may also miss its terminal equality "
+        "(dark)."
         if plan_figures.select_relaxed_plans(e.flight)
-        else "Slack is what state limits give way by, so that there is a plan at all. No plan that was flown gave way "
-        "anywhere."
+        else "Slack is the amount by which state limits are relaxed where no plan keeps them all. No flown plan "
+        "relaxed a constraint."
     )
     return (
-        "Each plan comes with a bound of the least cost there is: the gap between them is certified. "
+        "Each plan has a lower bound of the optimal cost: the gap between cost and bound is certified. "
         f"{plan_figures.describe_methods(e.flight)}{slack_text}"
     )
 
@@ -129,7 +132,7 @@ def _explain_timing(e: FlightEvidence) -> str:
         if e.flight.virtual_time
         else "lateness is from a tick's deadline to its start"
     )
-    return f"Decision time is spent in the core at ticks that solve; {lateness_text}."
+    return f"Decision time is the time of the control core at ticks that solve; {lateness_text}."
 
 
 def _show_events(e: FlightEvidence) -> Iterator[Part]:
@@ -174,21 +177,21 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
             Mark("dotted", "target", "target", when=lambda e: e.flight.moving_target),
             Mark("star", "target", "target", when=lambda e: not e.flight.moving_target),
             _LIMIT,
-            Mark("band", "limit", "space that a fence took", when=lambda e: plots.find_moving_limits(e.flight)),
-            Mark("ring", "limit", "where it left its limits", when=lambda e: e.excursions),
+            Mark("band", "limit", "space closed by a fence", when=lambda e: plots.find_moving_limits(e.flight)),
+            Mark("ring", "limit", "limit left here", when=lambda e: e.excursions),
             Mark("cross", "limit", "furthest outside", when=lambda e: e.excursions),
         ),
     ),
     PageSection(
         "Each axis against its limits",
         lambda e: plots.draw_axes_over_time(e.flight),
-        note="The band along a limit is the largest reserve that the plan of the moment kept from it.",
+        note="The band along a limit is the largest back-off of the plan at that time.",
         legend=(
             _TRUTH,
             _ESTIMATE,
             _TARGET,
             _LIMIT,
-            Mark("band", "limit", "reserve kept"),
+            Mark("band", "limit", "back-off"),
             Mark("cross", "limit", "outside", when=lambda e: find_state_violations(e.flight).any()),
             _FALLBACK,
         ),
@@ -196,8 +199,8 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
     PageSection(
         "Inputs",
         lambda e: figures.draw_inputs(e.flight),
-        note="The colour tells how far into its plan the controller was when it gave the input: from blue, the first "
-        "step of a plan, to orange, its last.",
+        note="The colour shows the index within the plan that gave the input: from blue, the first step of a plan, to "
+        "orange, its last.",
         legend=(
             _LIMIT,
             Mark("cross", "limit", "outside", when=lambda e: find_input_violations(e.flight).any()),
@@ -211,7 +214,7 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
         legend=(
             Mark("line", "estimate", "measured"),
             Mark("thin", "estimate", "lower bound in flight", when=lambda e: e.flight.link_estimates),
-            Mark("dashed", "limit", "horizon H; share of news that the design counts on"),
+            Mark("dashed", "limit", "horizon H; share of steps with a new position that the design counts on"),
             Mark("band", "limit", "delay configured", when=lambda e: e.judged.verdicts.link.delay is not None),
             Mark("tick", "lost", "position lost", when=lambda e: e.flight.truths),
             _FALLBACK,
@@ -227,7 +230,7 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
     PageSection(
         "Plans against what was flown",
         _draw_plans,
-        note="A few plans on the way to the target, each with the back-off that it keeps from a limit at that stage.",
+        note="A few plans on the way to the target, each with its back-off from the limits at each stage.",
         legend=(
             Mark("line", "truth", "flown", when=lambda e: e.flight.truths),
             Mark("line", "truth", "flown (estimate)", when=lambda e: not e.flight.truths),
@@ -254,7 +257,7 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
     ),
     *verdict_sections.SECTIONS,
     *origin_sections.SECTIONS,
-    PageSection("Events", _show_events, empty_text="There were none."),
+    PageSection("Events", _show_events, empty_text="There were no events."),
     PageSection("Summary", _show_summary),
 )
 

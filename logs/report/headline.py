@@ -1,6 +1,6 @@
 """Headline of a flight: the rules' findings, ranked, with how the flight ended and where it stayed.
 
-Each rule looks at one kind of cause and yields its findings. `logs.report.causes` ranks them.
+Each rule looks at one kind of cause and yields its findings. `uavctl.cause` ranks them.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ _END_CAUSES = frozenset(
         Cause.MODE_LEFT,
     }
 )
-_FINAL_MODES = (ControlMode.LAND, ControlMode.STOPPED)  # told by `_how`
+_FINAL_MODES = (ControlMode.LAND, ControlMode.STOPPED)  # reported by `_describe_outcome`
 _PLACE_CAUSES = frozenset(
     {Cause.LEFT_LIMITS, Cause.TOUCHED_LIMIT, Cause.NOT_FLOWN, Cause.POSITIONS_ABSENT, Cause.POSITIONS_INVALID}
 )

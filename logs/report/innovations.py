@@ -34,7 +34,7 @@ from uavctl.wiring.controller import build_estimator, build_plant
 # Positions that are looked at, the first of the flight: enough to find a deviation that is 3 % wrong.
 MAX_POSITIONS = 20_000
 
-# The first positions after a start tell of how it began, not of the model.
+# The first positions after a start depend on the initial state, not on the model.
 SETTLING_POSITIONS = 5
 
 
@@ -78,7 +78,7 @@ class FilterReplay:
     """Positions and inputs of a flight in order of capture.
 
     Args:
-        dead_ns: From sending an input until it begins to act, as the flight's filter believed [ns].
+        dead_ns: From sending an input until it begins to act, as the flight's filter assumed [ns].
     """
 
     def __init__(self, flight: FlightData, kalman: Kalman, dead_ns: int = 0) -> None:

@@ -57,7 +57,7 @@ def _draw_arrivals(flight: FlightData) -> Drawing:
     t_s = flight.seconds([estimate.at_ns for estimate in estimates])
     promised = estimates[-1].promised
     with open_canvas("link-estimate", 2.5) as canvas:
-        ax = canvas.axes("Steps with news, as believed in flight", "time [s]", "probability of news")
+        ax = canvas.axes("Steps with a new position, estimated in flight", "time [s]", "probability")
         ax.step(
             *thin_samples(t_s, np.array([e.arrival_lower for e in estimates])),
             where="post",
@@ -73,7 +73,9 @@ def _draw_arrivals(flight: FlightData) -> Drawing:
         ax.axhline(promised, color=colour("limit"), lw=1.2, ls=DASHED)
         ax.set_ylim(-0.02, 1.02)
         set_time_axis(ax, flight)
-    label = f"Believed probability of news over time with its lower bound; the design counts on {promised:.3g}"
+    label = (
+        f"Estimated probability of a new position over time with its lower bound; the design counts on {promised:.3g}"
+    )
     return Drawing("link-estimate", canvas.svg, label)
 
 
@@ -83,7 +85,7 @@ def _draw_delay_histogram(flight: FlightData, verdict: LinkVerdict) -> Drawing:
     delay = verdict.delay
     with open_canvas("link-delay", 2.5) as canvas:
         ax = canvas.axes("Capture to arrival, by the stamps", "delay [ms]", "positions")
-        # One position that came very late would leave nothing of the others' shape.
+        # One very late position would compress the rest of the histogram.
         edge = float(np.percentile(finite_ms, 99.5)) * 1.3 + 1.0
         counted_ms = np.minimum(finite_ms, edge)
         counts, edges = np.histogram(counted_ms, _BINS, (min(0.0, counted_ms.min()), max(1.0, counted_ms.max())))
@@ -93,5 +95,5 @@ def _draw_delay_histogram(flight: FlightData, verdict: LinkVerdict) -> Drawing:
             min_span = _MIN_SPAN_SHARE * max(high, edges[-1])
             ax.axvspan(low, max(high, low + min_span), color=colour("limit"), alpha=0.13, lw=0)
         ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    label = "Histogram of the time from capture to arrival of the positions, with the span that was configured"
+    label = "Histogram of the time from capture to arrival of the positions, with the configured span"
     return Drawing("link-delay", canvas.svg, label)

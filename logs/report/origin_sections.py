@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from logs.report.evidence import FlightEvidence
 from logs.report.page import PageSection, Part, render_facts, render_folded, render_table
 
-# Numbers that say no more than that it hardly ever happens are told as one.
+# Negligible probabilities are shown as one value.
 _NEGLIGIBLE = 1e-6
 _DESIGN = {
     "horizon": "Horizon H [steps]",

@@ -19,9 +19,9 @@ _ROLES = ("estimate", "sample", "target", "plan", "limit")
 _MIN_GAP = 1e-12
 _PERCENT = 100.0
 _METHOD_TEXTS = {
-    "frozen": "with the policy that was made beforehand, which is the best there",
-    "mixture": "with several policies made beforehand, weighed together (up to version 0.2)",
-    "exact": "with a policy found for this very plan",
+    "frozen": "with a policy computed beforehand, proven optimal for this plan",
+    "mixture": "with a mixture of policies computed beforehand (up to version 0.2)",
+    "exact": "with a policy computed for this plan",
 }
 
 
@@ -37,11 +37,11 @@ def describe_methods(flight: FlightData) -> str:
         f"“{name}”: {_METHOD_TEXTS[name]}"
         for name in sorted({plan.method for plan in flight.plans} & set(_METHOD_TEXTS))
     ]
-    return f"Plans were found in these ways: {'; '.join(texts)}. " if texts else ""
+    return f"Methods that found plans: {'; '.join(texts)}. " if texts else ""
 
 
 def draw_certificates(flight: FlightData) -> Iterator[Drawing]:
-    """Draw the certified gap of each plan, and the slack of those in which a constraint gave way."""
+    """Draw the certified gap of each plan, and the slack of plans with a relaxed constraint."""
     if has_variation(np.array([plan.gap for plan in flight.plans])):
         yield _draw_gaps(flight)
     relaxed_plans = select_relaxed_plans(flight)
@@ -50,7 +50,7 @@ def draw_certificates(flight: FlightData) -> Iterator[Drawing]:
 
 
 def select_relaxed_plans(flight: FlightData) -> list[Plan]:
-    """Return the flown plans in which a constraint gave way."""
+    """Return the flown plans with a relaxed constraint."""
     return [plan for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE]
 
 
@@ -69,7 +69,7 @@ def _draw_gaps(flight: FlightData) -> Drawing:
         ax.margins(y=0.08)
         ax.autoscale_view()
         low, high = np.log10(ax.get_ylim())
-        if np.floor(high) <= np.ceil(low):  # a single tick would say nothing of the scale
+        if np.floor(high) <= np.ceil(low):  # a single tick does not show the scale
             ax.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
         set_time_axis(ax, flight)
     label = "Certified gap of each plan between its cost and the least possible, in percent of the cost, over time"
@@ -79,7 +79,7 @@ def _draw_gaps(flight: FlightData) -> Drawing:
 def _draw_slack(flight: FlightData, plans: list[Plan]) -> Drawing:
     t_s = flight.seconds([plan.base_ns for plan in plans])
     with open_canvas("plan-slack", 2.5) as canvas:
-        ax = canvas.axes("What gave way in plans flown", "time [s]", "sum over rows, their units")
+        ax = canvas.axes("Relaxed constraints of flown plans", "time [s]", "sum over rows, their units")
         for role, values in (
             ("sample", np.array([plan.slack for plan in plans])),
             ("limit", np.array([plan.terminal_miss for plan in plans])),
@@ -89,4 +89,6 @@ def _draw_slack(flight: FlightData, plans: list[Plan]) -> Drawing:
         ax.margins(y=0.08)
         ax.autoscale_view()
         set_time_axis(ax, flight)
-    return Drawing("plan-slack", canvas.svg, "Slack of the state limits and of the rest at the end of plans, over time")
+    return Drawing(
+        "plan-slack", canvas.svg, "Slack of the state limits and of the missed terminal equality of plans, over time"
+    )

@@ -239,9 +239,9 @@ def draw_axes_over_time(flight: FlightData) -> Iterator[Drawing]:
 
 
 def _is_moving(flight: FlightData, index: int) -> bool:
-    """Return whether a state, believed or true, has more than one value."""
-    believed = np.array([estimate.mean[index] for estimate in select_trusted_estimates(flight)])
-    return has_variation(believed) or has_variation(np.array([truth.state[index] for truth in flight.truths]))
+    """Return whether a state, estimated or true, has more than one value."""
+    estimated = np.array([estimate.mean[index] for estimate in select_trusted_estimates(flight)])
+    return has_variation(estimated) or has_variation(np.array([truth.state[index] for truth in flight.truths]))
 
 
 def _draw_state(flight: FlightData, axis: str, index: int, y_label: str, title: str) -> Drawing:

@@ -1,4 +1,4 @@
-"""Sentences below a flight's headline: what stands behind it and is no finding of its own."""
+"""Sentences below a flight's headline: details that are not findings of their own."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from logs.report.excursion import GRAVE_M, Excursion, select_trusted_estimates
 from logs.report.findings import metres, seconds
 from uavctl.number_text import format_number
 
-_MIN_ESTIMATE_ERROR_M = 0.3  # between the estimate and the true place: worth telling
-_GATE_SHARE = 0.15  # of the setpoints: setting out takes some
+_MIN_ESTIMATE_ERROR_M = 0.3  # between the estimate and the true place: worth reporting
+_GATE_SHARE = 0.15  # of the setpoints: some are limited at departure
 _BOUND_SHARE = 0.999  # of the largest bias
 _NEAR_BOUND_SHARE = 0.7  # of the acceleration that the envelope allows to be unexplained
 _DIRECTIONS = {"north": ("north", "south"), "east": ("east", "west"), "down": ("down", "up")}
 
 
 def describe_reasons(e: FlightEvidence, worst: Excursion | None) -> Iterator[str]:
-    """Return the sentences; `worst` is the excursion that the headline tells of, None if it tells of another cause."""
+    """Return the sentences; `worst` is the excursion in the headline, None if the headline has another cause."""
     if worst is not None:
         yield from _describe_excursion(e, worst)
     yield from _describe_gate(e)
@@ -31,7 +31,7 @@ def describe_reasons(e: FlightEvidence, worst: Excursion | None) -> Iterator[str
 
 def _describe_excursion(e: FlightEvidence, worst: Excursion) -> Iterator[str]:
     end_text = "to the end of the recording" if worst.return_s is None else f"until {seconds(worst.return_s)}"
-    text = f"It was beyond the {worst.wall} from {seconds(worst.exit_s)} on, {end_text}"
+    text = f"The vehicle was beyond the {worst.wall} from {seconds(worst.exit_s)} on, {end_text}"
     other_excursions = [
         f"{metres(excursion.beyond_m)} {excursion.passage} at {seconds(excursion.worst_s)}"
         for excursion in e.excursions[1:3]
@@ -41,8 +41,8 @@ def _describe_excursion(e: FlightEvidence, worst: Excursion) -> Iterator[str]:
     push = e.estimate_push(worst)
     if push is not None:
         yield (
-            f"From {seconds(push.begun_s)} to {seconds(push.ended_s)} it was pushed outwards by "
-            f"{push.accel_mps2:.1f} m/s² beside its setpoints."
+            f"From {seconds(push.begun_s)} to {seconds(push.ended_s)} the vehicle was pushed outwards by "
+            f"{push.accel_mps2:.1f} m/s² in addition to its setpoints."
         )
     estimate_text = _describe_estimate_error(e, worst)
     if estimate_text is not None:
@@ -50,7 +50,7 @@ def _describe_excursion(e: FlightEvidence, worst: Excursion) -> Iterator[str]:
 
 
 def _describe_estimate_error(e: FlightEvidence, worst: Excursion) -> str | None:
-    """Return a sentence on where the estimate put it at the worst moment; None if about right, or not known."""
+    """Return a sentence on the error of the estimate at the worst moment; None if small or unknown."""
     flight, at_ns = e.flight, e.flight.origin_ns + round(worst.worst_s * 1e9)
     nearest = min(select_trusted_estimates(flight), key=lambda estimate: abs(estimate.at_ns - at_ns), default=None)
     if not flight.truths or nearest is None or abs(nearest.at_ns - at_ns) > flight.tick_ns:
@@ -58,7 +58,7 @@ def _describe_estimate_error(e: FlightEvidence, worst: Excursion) -> str | None:
     error_m = float(np.linalg.norm(np.subtract(flight.design.position_of(nearest.mean), worst.worst_m)))
     if not np.isfinite(error_m) or error_m < _MIN_ESTIMATE_ERROR_M:
         return None
-    return f"At {seconds(worst.worst_s)} the estimate put it {metres(error_m)} away from where it was."
+    return f"At {seconds(worst.worst_s)} the estimate was {metres(error_m)} from the true position."
 
 
 def _describe_gate(e: FlightEvidence) -> Iterator[str]:
@@ -89,16 +89,16 @@ def _describe_bias(e: FlightEvidence) -> Iterator[str]:
 
 
 def _describe_model(e: FlightEvidence) -> Iterator[str]:
-    """Return sentences on what positions showed that nothing sent explains, and on errors of the forecast."""
+    """Return sentences on unexplained acceleration and on errors of the forecast."""
     unexplained = [(d.unexplained_mps2, d.at_ns) for d in e.flight.decisions if d.unexplained_mps2 is not None]
     bound = None if e.config is None else e.config.envelope.unexplained_mps2
     if unexplained and bound:
         max_mps2, at_ns = max(unexplained)
         if max_mps2 > _NEAR_BOUND_SHARE * bound:
             yield (
-                f"Positions showed {max_mps2:.1f} m/s² that no setpoint had asked for, at "
+                f"Positions showed {max_mps2:.1f} m/s² that no setpoint explains, at "
                 f"{seconds(e.to_seconds(at_ns))}; "
-                f"{format_number(bound)} m/s² is what wind and the model's error may make."
+                f"the envelope allows {format_number(bound)} m/s² for wind and model error."
             )
     model = e.judged.verdicts.model
     axes = () if model is None else model.axes
@@ -111,16 +111,15 @@ def _describe_model(e: FlightEvidence) -> Iterator[str]:
         yield (
             f"Errors of the forecast were larger than the model expects ({sizes}, over {large_axes[0].count} "
             f"positions): "
-            "more wind, or noisier positions, than it was made for."
+            "more wind or noisier positions than assumed."
         )
     elif correlated_axes:
         correlations = ", ".join(
             f"{verdict.correlation[0]:.1f} {verdict.axis}".replace("-", "−") for verdict in correlated_axes
         )
         yield (
-            f"An error of the forecast says something of the next one (correlation {correlations}, over "
-            f"{correlated_axes[0].count} "
-            "positions): wind that stays for a while, or a vehicle that answers otherwise."
+            f"Successive errors of the forecast are correlated ({correlations}, over {correlated_axes[0].count} "
+            "positions): lasting wind, or a vehicle that responds differently from the model."
         )
 
 
@@ -128,4 +127,4 @@ def _describe_failed_solves(e: FlightEvidence) -> Iterator[str]:
     failed = [d for d in e.flight.decisions if d.solve is not None and d.solve.value != "optimal"]
     if failed:
         at_s = e.to_seconds(failed[0].at_ns)
-        yield f"{count(len(failed), 'plan')} of {e.summary.solves} came to no optimum, first at {seconds(at_s)}."
+        yield f"{count(len(failed), 'plan')} of {e.summary.solves} reached no optimum, first at {seconds(at_s)}."

@@ -27,7 +27,7 @@ _SLIGHT_M = 0.02  # beyond a wall: no more than what a camera and the estimator 
 
 
 def describe_depth(e: FlightEvidence, excursion: Excursion) -> str:
-    """Return how far beyond a limit it was; a floor is the end of every fall, whatever the estimate puts below it."""
+    """Return how far beyond a limit it was; a fall ends at the floor, whatever the estimate."""
     is_estimated = not e.flight.truths
     return (
         "down to the floor"
@@ -37,12 +37,12 @@ def describe_depth(e: FlightEvidence, excursion: Excursion) -> str:
 
 
 def describe_source(e: FlightEvidence, at_s: float) -> str:
-    """Return by what it is known where the vehicle was at a time; empty where that is the truth."""
+    """Return the source of the vehicle's position at a time; empty where that is the truth."""
     if e.flight.truths:
         return ""
     breach = e.flight.breach
     is_doubted = breach is not None and breach.code in POSITION_CODES and at_s >= e.breach_s
-    source = "positions that were no longer believed" if is_doubted else "the estimate"
+    source = "positions that were no longer used" if is_doubted else "the estimate"
     return f" (by {source}: the true state is unknown)"
 
 
@@ -62,11 +62,11 @@ def _describe_circumstances(e: FlightEvidence, excursion: Excursion) -> str:
     errors_m = e.position_error_m[e.position_error_t_s <= excursion.worst_s]
     max_error_m = float(errors_m.max(initial=0.0))
     if max_error_m > WRONG_POSITION_M:
-        text = f", flown on positions that were {metres(max_error_m)} off"
+        text = f", with positions that were {metres(max_error_m)} off"
     if e.estimate_push(excursion) is not None and not e.battery_faults:
-        text += " while wind carried it" if text else ", carried by wind"
+        text += " and pushed by wind" if text else ", pushed by wind"
     if e.find_decision(excursion.worst_s).mode in (ControlMode.LAND, ControlMode.STOPPED):
-        text += ", after it was let go" if e.flight.breach is not None else ", in the vehicle's own landing"
+        text += ", after the release" if e.flight.breach is not None else ", in the vehicle's own landing"
     return text
 
 
@@ -79,7 +79,7 @@ def find_vehicle_loss(e: FlightEvidence) -> Iterator[Finding]:
     end_s = float(heartbeat_s[-1])
     if gaps_s.size and gaps_s.max() > HEARTBEAT_TIMEOUT_S:
         begun_s, ended_s = (float(t) for t in heartbeat_s[gaps_s.argmax() :][:2])
-        text = f"no heartbeat of it came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
+        text = f"no heartbeat came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
         connection_losses = [
             event for event in flight.events if event.code in DISCONNECT_TEXTS and event.subject == VEHICLE
         ]
@@ -92,7 +92,7 @@ def find_vehicle_loss(e: FlightEvidence) -> Iterator[Finding]:
     restarted_s = e.find_first_s(EventCode.VEHICLE_REBOOT)
     if restarted_s is not None or cause == Cause.VEHICLE_RESTARTED:
         at_s = end_s if restarted_s is None else restarted_s
-        yield Finding(Cause.VEHICLE_RESTARTED, at_s, f"its autopilot started anew at {seconds(at_s)}")
+        yield Finding(Cause.VEHICLE_RESTARTED, at_s, f"its autopilot restarted at {seconds(at_s)}")
     if cause == Cause.VEHICLE_DISARMED:
         disarmed_ns = [after.at_ns for before, after in pairwise(flight.vehicles) if before.armed and not after.armed]
         at_s = e.to_seconds(disarmed_ns[0]) if disarmed_ns else end_s
@@ -112,7 +112,10 @@ def find_process_pause(e: FlightEvidence) -> Iterator[Finding]:
     longest_ns, begun_ns = max(pauses, default=(0, 0))
     if longest_ns > MIN_STALL_S * 1e9:
         at_s = e.to_seconds(begun_ns)
-        text = f"it did not run for {seconds(longest_ns * 1e-9)}, from {seconds(at_s)} on, and sent no setpoints"
+        text = (
+            f"the controller did not run for {seconds(longest_ns * 1e-9)}, from {seconds(at_s)} on, and sent no "
+            "setpoints"
+        )
         yield Finding(Cause.STOOD_STILL, at_s, text)
 
 
@@ -133,7 +136,7 @@ def find_recording_cut(e: FlightEvidence) -> Iterator[Finding]:
 
 
 def find_blind_flight(e: FlightEvidence) -> Iterator[Finding]:
-    """Find the longest time without any position, if it was flown blind; refused positions are told by `_refused`."""
+    """Find the longest time without any position, if it was flown blind; refused ones are another rule's."""
     begun_s, ended_s = e.find_longest_silence()
     arrivals = int(np.count_nonzero((e.captured_s > begun_s + 1e-6) & (e.captured_s < ended_s)))
     if ended_s - begun_s <= e.get_blind_age_s() or arrivals > NEGLIGIBLE_COUNT:
@@ -150,5 +153,5 @@ def find_blind_flight(e: FlightEvidence) -> Iterator[Finding]:
     )
     drift_m = e.compute_max_drift_m(begun_s, ended_s)
     if drift_m is not None and drift_m >= GRAVE_M:
-        text += f"; it drifted {metres(drift_m)} away from its prediction"
+        text += f"; the vehicle drifted {metres(drift_m)} away from the prediction"
     yield Finding(Cause.FLOWN_BLIND if has_given_up else Cause.SILENCE, begun_s, text, ended_s)

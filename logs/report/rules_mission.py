@@ -30,9 +30,9 @@ _ARRIVAL_SHARE = 0.1  # distance from the target at the end, of that at the begi
 _SLIGHT_SHARE = 0.05  # beyond a limit, of that limit: 7 cm/s of 1.5 m/s
 _MIN_PUSH_S = 1.0  # with a bias at its bound: shorter ones are gusts
 _MIN_RISE_M = 0.15  # from where it stood: more than positions are off by, less than any take-off
-_MIN_ARMED_S, _MIN_POSITIONS = 3.0, 20  # time armed and positions in it: enough to tell that it did not move
+_MIN_ARMED_S, _MIN_POSITIONS = 3.0, 20  # time armed and positions in it: enough to judge that it did not move
 
-# Orders before a flight, as the vehicle's answers to them begin, and what each of them asks of it.
+# Orders before a flight, as the vehicle's answers to them begin, and the request in words.
 _START_ORDERS = {"DO_SET_MODE": "change its mode", "COMPONENT_ARM_DISARM": "arm"}
 _MAX_TEXTS = 3  # texts of the vehicle in one sentence
 
@@ -201,7 +201,7 @@ def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
     if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
         near_m, at_s = float(compute_position_errors_m(flight).min()), last_s
         cause = Cause.OFF_TRACK if s.trajectory else Cause.NOT_REACHED
-        yield Finding(cause, at_s, f"it never came nearer to its target than {metres(near_m)}")
+        yield Finding(cause, at_s, f"its nearest distance from the target was {metres(near_m)}")
     elif s.course_worst_m > accept_m or s.course_rms_m > _MAX_RMS_SHARE * accept_m:
         course_text = "its trajectory on the whole way" if s.trajectory else "its target from its arrival on"
         text = (
@@ -236,11 +236,11 @@ def _describe_unreachable_target(e: FlightEvidence) -> str:
 
 
 def find_wind_push(e: FlightEvidence) -> Iterator[Finding]:
-    """Find a lasting push as strong as may be flown against; a battery that gives in pushes down like a wind."""
+    """Find a lasting push at the bound of the bias; a failing battery pushes down like a wind."""
     at_s, external_exit = e.find_first_s("bias-at-bound"), find_external_exit(e)
     flight_end_s = (
         e.breach_s if external_exit is None else min(e.breach_s, external_exit[0] - HEARTBEAT_S)
-    )  # its mode is told that late
+    )  # its mode is reported that late
     if at_s is None or at_s >= flight_end_s or e.battery_faults:
         return
     until_s = next(
@@ -252,14 +252,14 @@ def find_wind_push(e: FlightEvidence) -> Iterator[Finding]:
         e.to_seconds(e.flight.decisions[-1].at_ns),
     )
     if until_s - at_s > _MIN_PUSH_S:
-        yield Finding(Cause.WIND, at_s, f"what pushed was as strong as may be flown against, from {seconds(at_s)} on")
+        yield Finding(Cause.WIND, at_s, f"a push as strong as the controller can compensate, from {seconds(at_s)} on")
 
 
 def find_relaxed_plans(e: FlightEvidence) -> Iterator[Finding]:
-    """Find that a constraint gave way in more than a few plans that were flown."""
+    """Find that a constraint was relaxed in more than a few flown plans."""
     plans = e.flight.flown_plans
     if e.summary.slack_used > NEGLIGIBLE_SHARE * max(1, len(plans)):
-        text = f"in {e.summary.slack_used} of {count(len(plans), 'plan')} that were flown a constraint gave way"
+        text = f"in {e.summary.slack_used} of {count(len(plans), 'flown plan')} a constraint was relaxed"
         yield Finding(Cause.PLANS_RELAXED, e.find_first_s(EventCode.RELAXED) or 0.0, text)
 
 
@@ -268,10 +268,10 @@ def find_link_trouble(e: FlightEvidence) -> Iterator[Finding]:
     link = e.judged.verdicts.link
     if link.promised_news is not None and link.news.trials and link.news.high < link.promised_news:
         text = (
-            f"{100 * link.news.rate:.0f} % of the steps had a position captured within them, and the design counts on "
+            f"{100 * link.news.rate:.0f} % of the steps had a new position; the design counts on "
             f"{100 * link.promised_news:.0f} %"
         )
         yield Finding(Cause.LINK_WORSE, 0.0, text)
     second_s = e.find_first_s(EventCode.SECOND_VEHICLE)
     if second_s is not None:
-        yield Finding(Cause.SECOND_VEHICLE, second_s, f"it was heard on the vehicle's link at {seconds(second_s)}")
+        yield Finding(Cause.SECOND_VEHICLE, second_s, f"heard on the vehicle's link at {seconds(second_s)}")

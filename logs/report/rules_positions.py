@@ -21,19 +21,19 @@ _MAX_DRIFT_STEP_M = 0.1  # what a drifting source adds from one position to the 
 _UNUSABLE_SHARE = 0.2  # of positions: more than come out of order, or twice, on any link
 _RELAY_TIMEOUT_S = 2.0  # without a position passed on: vehicles' estimators give up after 5 to 7 s
 _SAMPLE_CAUSES = (
-    (Cause.POSITIONS_FROZEN, (EventCode.SAMPLE_FROZEN,), "the camera sent the same position again and again"),
-    (Cause.POSITIONS_JUMPED, (EventCode.SAMPLE_JUMP,), "positions were where the vehicle cannot have been"),
+    (Cause.POSITIONS_FROZEN, (EventCode.SAMPLE_FROZEN,), "the camera repeated one position"),
+    (Cause.POSITIONS_JUMPED, (EventCode.SAMPLE_JUMP,), "positions were where the vehicle could not be"),
     (
         Cause.STAMPS_UNUSABLE,
         (EventCode.SAMPLE_FUTURE, EventCode.SAMPLE_TOO_OLD, EventCode.SAMPLE_DUPLICATE),
-        "stamps lay in the future, were too old or came twice",
+        "stamps were in the future, too old or repeated",
     ),
-    (Cause.POSITIONS_INVALID, (EventCode.SAMPLE_INVALID,), "positions were no finite numbers, or absurd"),
+    (Cause.POSITIONS_INVALID, (EventCode.SAMPLE_INVALID,), "positions were not finite, or absurd"),
 )
 
 
 def find_refused_samples(e: FlightEvidence) -> Iterator[Finding]:
-    """Find positions that came and were not believed, by reason."""
+    """Find positions that came and were refused, by reason."""
     arrived = max(1, len(e.captured_s))
     for cause, codes, text in _SAMPLE_CAUSES:
         refused, first_s = e.count_refused(*codes)
@@ -54,7 +54,7 @@ def _find_unusable_stamps(e: FlightEvidence) -> Iterator[Finding]:
         if refused > _UNUSABLE_SHARE * (refused + link_stats.samples):
             main_reason = max(refused_by_reason, key=lambda reason: refused_by_reason[reason])
             share = f"{refused} of {count(refused + link_stats.samples, 'position')} on “{link_stats.link}”"
-            yield Finding(Cause.STAMPS_UNUSABLE, 0.0, f"{share} had none that counts ({main_reason})")
+            yield Finding(Cause.STAMPS_UNUSABLE, 0.0, f"{share} had no usable stamp ({main_reason})")
 
 
 def find_wrong_positions(e: FlightEvidence) -> Iterator[Finding]:
@@ -66,7 +66,7 @@ def find_wrong_positions(e: FlightEvidence) -> Iterator[Finding]:
     steps_m = np.abs(np.diff(e.position_error_m[: first + 1]))
     is_drift = float(steps_m.max(initial=0.0)) < _MAX_DRIFT_STEP_M and first > 0
     text = (
-        f"{count(int(is_wrong.sum()), 'position')} that came lay over {metres(WRONG_POSITION_M)} from the true "
+        f"{count(int(is_wrong.sum()), 'position')} were over {metres(WRONG_POSITION_M)} from the true "
         f"place, first at "
         f"{seconds(float(e.position_error_t_s[first]))}; at worst {metres(float(e.position_error_m[worst]))}, at "
         f"{seconds(float(e.position_error_t_s[worst]))}"
@@ -86,9 +86,7 @@ def find_absent_positions(e: FlightEvidence) -> Iterator[Finding]:
         reason_text = f" ({', '.join(kinds)})" if kinds else ""
         yield Finding(Cause.POSITIONS_INVALID, 0.0, f"none of {count(arrivals, 'position')} could be used{reason_text}")
     elif unreadable := sum(link.bad.get(BAD_FIELD, 0) for link in e.last_link_stats):
-        yield Finding(
-            Cause.POSITIONS_INVALID, 0.0, f"{count(unreadable, 'message')} had values that are no finite numbers"
-        )
+        yield Finding(Cause.POSITIONS_INVALID, 0.0, f"{count(unreadable, 'message')} had values that are not finite")
     elif not any(_find_unusable_stamps(e)):
         yield Finding(Cause.POSITIONS_ABSENT, 0.0, f"none came in {seconds(e.flight.duration_s)}")
 
@@ -105,7 +103,7 @@ def find_wrong_attitude(e: FlightEvidence) -> Iterator[Finding]:
 
 
 def find_relay_silence(e: FlightEvidence) -> Iterator[Finding]:
-    """Find that the vehicle, which lives on the positions that are passed on to it, got none."""
+    """Find that the vehicle, which navigates by the positions that are passed on to it, got none."""
     silent_s = e.find_first_s(EventCode.RELAY_SILENT)
     if silent_s is None:
         silent_s = _find_relay_gap_s(e)
@@ -116,7 +114,7 @@ def find_relay_silence(e: FlightEvidence) -> Iterator[Finding]:
     )
     reason = "" if report is None else report.silent_for
     if reason == HELD_BACK and silent_s >= e.breach_s:
-        return  # it was let go, and so they were held back
+        return  # after the release they are held back
     begun_s = silent_s if report is None or report.last_ns is None else min(silent_s, e.to_seconds(report.last_ns))
     resumption_times = (e.to_seconds(o.at_ns) for o in e.flight.events if o.code == EventCode.RELAY_RESUMED)
     resumed_s = next((at_s for at_s in resumption_times if at_s > silent_s), None)

@@ -25,8 +25,8 @@ _FENCE_ENDS = frozenset({Cause.VEHICLE_FENCE, Cause.FENCE_LANDED})
 
 
 def find_vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
-    """Find what the vehicle said that a pilot must know, each cause once."""
-    last_change = ""  # the change of mode that was told last: one text after another tells of the same
+    """Find the vehicle's texts that a pilot must know, each cause once."""
+    last_change = ""  # the change of mode reported last: several texts may report the same
     texts = [
         event
         for event in e.flight.events
@@ -36,7 +36,7 @@ def find_vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
         at_s = e.to_seconds(event.at_ns)
         previous_change, last_change = last_change, _describe_mode_change(e, at_s)
         mode = "" if last_change == previous_change else last_change
-        yield Finding(cause, at_s, f'it said "{event.text.strip()}" at {seconds(at_s)}{mode}')
+        yield Finding(cause, at_s, f'the vehicle reported "{event.text.strip()}" at {seconds(at_s)}{mode}')
 
 
 def _describe_mode_change(e: FlightEvidence, at_s: float) -> str:
@@ -55,7 +55,7 @@ def _describe_mode_change(e: FlightEvidence, at_s: float) -> str:
 
 
 def find_failsafe(e: FlightEvidence) -> Iterator[Finding]:
-    """Find a failsafe of the vehicle's own that its heartbeats or the end of the flight tell of."""
+    """Find a failsafe of the vehicle's own that its heartbeats or the end of the flight show."""
     code = e.summary.ending.code
     failsafe_status = next((o for o in e.flight.vehicles if o.armed and (o.failsafe or o.mode in FAILSAFE_MODES)), None)
     texts = {finding.cause for finding in find_vehicle_texts(e)} & _FAILSAFE_CAUSES
@@ -75,7 +75,7 @@ def find_failsafe(e: FlightEvidence) -> Iterator[Finding]:
 
 
 def find_takeover(e: FlightEvidence) -> Iterator[Finding]:
-    """Find who took the vehicle out of the mode that takes setpoints, if not we and no failsafe."""
+    """Find the cause that took the vehicle out of the mode that takes setpoints, if not we and no failsafe."""
     code = e.summary.ending.code
     external_exit = find_external_exit(e)
     if code in (Cause.PILOT, Cause.PILOT_LANDED):
@@ -91,7 +91,7 @@ def find_takeover(e: FlightEvidence) -> Iterator[Finding]:
         yield Finding(
             Cause.MODE_LEFT,
             external_exit[0],
-            f"the vehicle went to {external_exit[1]} at {seconds(external_exit[0])}; who asked is unknown",
+            f"the vehicle went to {external_exit[1]} at {seconds(external_exit[0])}; the requester is unknown",
         )
 
 

@@ -61,8 +61,8 @@ def clopper_pearson(hits: int, trials: int, level: float = RUNS_LEVEL) -> Interv
 def max_step_rate(hits: NDArray[np.int64], runs: int, steps: int, level: float = RUNS_LEVEL) -> tuple[float, Interval]:
     """Return the highest rate of any step, with an interval that holds for all steps at once.
 
-    The worst step is chosen by the same runs, so that an interval of its own would say too much: each step has the
-    exact one at the level 1 - (1 - `level`) / T (Bonferroni), and the worst one's is told.
+    The worst step is chosen by the same runs, so that an interval of its own would be too narrow: each step has the
+    exact one at the level 1 - (1 - `level`) / T (Bonferroni), and the worst one's is reported.
 
     Args:
         hits: Runs in which it happened, by step (K,), K <= T; none in those that follow.

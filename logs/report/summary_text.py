@@ -60,7 +60,7 @@ def _describe_rest(flight: FlightData) -> list[str]:
 
 
 def _describe_relaxed_plan(flight: FlightData) -> list[str]:
-    """Return a sentence on the constraint that gave way most in any plan flown; none where none did."""
+    """Return a sentence on the most relaxed constraint of any flown plan; none where none was relaxed."""
     names = flight.design.names
     plans = [plan for plan in flight.flown_plans.values() if plan.gave_way]
     if not plans:

@@ -18,7 +18,7 @@ from matplotlib.path import Path
 
 from uavctl.arrays import Array
 
-# role -> (light, dark). Okabe and Ito's colours, which colour-blind people can tell apart; lifted for dark pages.
+# role -> (light, dark). Okabe and Ito's colours, which colour-blind people can distinguish; lifted for dark pages.
 PALETTE = {
     "ink": ("#1f2933", "#e4e8ed"),
     "muted": ("#5d6875", "#a3adb8"),
@@ -138,7 +138,7 @@ class Canvas:
         return axes
 
     def cursor(self) -> str:
-        """Return an attribute that says where on the drawing the first axes are, and from where to where they go."""
+        """Return an attribute with the place of the first axes on the drawing and their range."""
         if not self.cursor_axes:
             return ""
         ax = self.figure.axes[0]
@@ -207,7 +207,7 @@ def _convert_to_inline(text: str, key: str) -> str:
     text = re.sub(r'\b(id=")', rf"\1{key}-", text)
     text = re.sub(r'(href="#|url\(#)', rf"\1{key}-", text)
     text = re.sub(r' d="([^"]*)"', lambda match: f' d="{compact_path(match.group(1))}"', text)
-    text = re.sub(r"font-family: [^;\"]*; ", "", text)  # the page says which
+    text = re.sub(r"font-family: [^;\"]*; ", "", text)  # the page sets it
     text = re.sub(r' (?:x|y|transform)="[^"]*"', lambda match: _shorten_numbers(match.group()), text)
     text = re.sub(r"\s*\n\s*", "\n", text)
     roles = {light: f"var(--{role},{light})" for role, (light, _) in PALETTE.items()}

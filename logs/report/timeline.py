@@ -1,4 +1,4 @@
-"""Timeline of a flight in lanes that mean one thing each: who flew, the vehicle's mode, steps without news, events."""
+"""Timeline of a flight: a lane each for the controller's mode, the vehicle's mode, steps without a position, events."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NO_TIMES = np.zeros(0)
 _EVENT_LANES = (
     (Severity.ERROR, "errors", "limit", "an error"),
     (Severity.WARNING, "warnings", "sample", "a warning"),
-    (Severity.INFO, "notes", "muted", "what else came"),
+    (Severity.INFO, "notes", "muted", "a note"),
 )
 _HAND_OVER_ROLES = {"engaged": "estimate", "failed": "limit", "landing": "limit", "settling": "limit"}
 
@@ -117,20 +117,20 @@ def make_lanes(flight: FlightData) -> Iterator[Lane]:
     """Return the lanes that this flight has something for; each means one thing."""
     decisions = flight.decisions
     plans = flight.flown_plans.values()
-    yield Lane("controller", "what flew", tuple(_list_mode_spans(flight)))
+    yield Lane("controller", "the controller's mode", tuple(_list_mode_spans(flight)))
     lanes = (
-        Lane("hand-over", "who is in charge", tuple(_list_hand_over_spans(flight))),
+        Lane("hand-over", "the state of the hand-over", tuple(_list_hand_over_spans(flight))),
         Lane("vehicle", "its own mode", tuple(_list_vehicle_spans(flight))),
-        _make_mark_lane(flight, "no news", "lost", "a step without a new position", _find_silent_steps(flight)),
+        _make_mark_lane(flight, "no position", "lost", "a step without a new position", _find_silent_steps(flight)),
         _make_mark_lane(
-            flight, "refused", "fallback", "a position that was not believed", (d for d in decisions if d.rejected)
+            flight, "refused", "fallback", "a position that was refused", (d for d in decisions if d.rejected)
         ),
         _make_mark_lane(
             flight, "limited", "plan", "a setpoint that the limiter changed", (s for s in flight.setpoints if s.limited)
         ),
         Lane(
-            "gave way",
-            "a plan that could not keep a constraint",
+            "relaxed",
+            "a plan with a relaxed constraint",
             marks=(
                 "sample",
                 flight.seconds([p.base_ns for p in plans if max(p.slack, p.terminal_miss) > SLACK_TOLERANCE]),
@@ -140,7 +140,7 @@ def make_lanes(flight: FlightData) -> Iterator[Lane]:
             flight,
             "no optimum",
             "limit",
-            "a plan that was not found",
+            "a solve without an optimum",
             (d for d in decisions if d.solve not in (None, SolveStatus.OPTIMAL)),
         ),
         Lane("outside", "the state beyond a limit", marks=("limit", flight.steps.t_s[find_state_violations(flight)])),
@@ -226,6 +226,6 @@ def _draw_lane(ax: Axes, lane: Lane, row: int, character_s: float) -> None:
 
 
 def _thin_marks(times_s: Array, shown_s: float) -> Array:
-    """Return times (n,) [s], of several too near to be told apart only the first."""
+    """Return times (n,) [s], of several too near to be distinguished only the first."""
     _, first = np.unique(np.floor(times_s / shown_s * MAX_MARKS), return_index=True)
     return times_s[first]

@@ -28,7 +28,7 @@ _SEVERITIES = {  # of MAV_SEVERITY; the others are notices
     "warning": Severity.WARNING,
 }
 _MAX_DISAGREEMENT_M = 0.5  # between its own position and those sent, beyond what their origins differ by
-_MAX_INTERPOLATION_S = 0.5  # between two of its own positions, to tell one in between
+_MAX_INTERPOLATION_S = 0.5  # between two of its own positions, to interpolate one in between
 _HEARTBEAT_S = 1.0  # between two heartbeats
 _ESTIMATOR_TIMEOUT_S = 5.0  # without a position: the soonest at which vehicles' estimators were seen to give up
 _SOURCE_TIMEOUT_S = 2.0  # without a position of one source while another's come: it stopped
@@ -68,16 +68,16 @@ def derive_tlog_headline(flight: MavlinkFlight) -> Headline:
     """Return what matters most in a flight of a foreign recording, while the vehicle was armed."""
     info = flight.info
     if info.vehicle_system is None:
-        return make_headline([Finding(Cause.NO_VEHICLE, 0.0, "no autopilot's heartbeat is in it")])
+        return make_headline([Finding(Cause.NO_VEHICLE, 0.0, "the recording holds no heartbeat of an autopilot")])
     armed = ArmedFlight(flight, find_armed_spans(info))
     others = list(_find_second_vehicle(armed))
     if not armed.spans:
         unarmed_flight = ArmedFlight(flight, [(0.0, np.inf)])
         sentences = [finding.sentence for finding in _find_texts(unarmed_flight)]
         arming = (
-            Finding(Cause.NOT_ARMED, 0.0, "the vehicle was never armed in it")
+            Finding(Cause.NOT_ARMED, 0.0, "the vehicle was never armed in this recording")
             if info.modes
-            else Finding(Cause.ARMING_UNKNOWN, 0.0, "nothing in it tells modes or arming")
+            else Finding(Cause.ARMING_UNKNOWN, 0.0, "the recording holds no modes or arming")
         )
         return make_headline([arming, *others], reasons=sentences)
     findings = sort_findings(finding for rule in RULES for finding in rule(armed))
@@ -91,32 +91,34 @@ def find_armed_spans(info: MavlinkFlightInfo) -> list[tuple[float, float]]:
 
 
 def _make_clear_finding(armed: ArmedFlight) -> Finding:
-    """Return that nothing was found, with what was looked at and what the recording does not tell."""
+    """Return that nothing was found, with the checks made and the data that the recording lacks."""
     flight = armed.flight
     texts = [f"armed for {seconds(sum(end - begin for begin, end in armed.spans))}"]
     if flight.sent:
         texts.append(f"no position was missing for longer than {format_number(_measure_silence(armed)[0], 2)} s")
         apart_m, apart_s, _ = _measure_disagreement(armed)
         if np.isfinite(apart_s):
-            texts.append(f"its own kept within {metres(apart_m)} of them")
+            texts.append(f"the vehicle's own position stayed within {metres(apart_m)} of them")
     else:
-        texts.append("it was sent no position")
+        texts.append("no position was sent to the vehicle")
     if armed.info.setpoints and not np.isfinite(flight.setpoint_m).any():
-        texts.append("where it was to be is not in it")
+        texts.append("the recording holds no position setpoints")
     if not len(flight.battery_v):
         texts.append("its battery is not known")
     return Finding(Cause.NOTHING_FOUND, 0.0, "; ".join(texts))
 
 
 def _find_texts(armed: ArmedFlight) -> Iterator[Finding]:
-    """Find what it said that a pilot must know, each cause once."""
+    """Find the vehicle's texts that a pilot must know, each cause once."""
     is_armed = armed.inside(np.array([text.at_s for text in armed.info.texts]), _HEARTBEAT_S)
     texts = [text for text, is_inside in zip(armed.info.texts, is_armed, strict=True) if is_inside]
     for text, cause in classify_texts(texts, lambda text: _SEVERITIES.get(text.severity, Severity.INFO)):
         before, after = armed.mode_at(text.at_s - _HEARTBEAT_S), armed.mode_at(text.at_s + 2.0 * _HEARTBEAT_S)
         mode = f"from {before} to {after}" if before != after else after
         yield Finding(
-            cause, text.at_s, f'it said "{text.text.strip()}" ({text.severity}) at {seconds(text.at_s)} ({mode})'
+            cause,
+            text.at_s,
+            f'the vehicle reported "{text.text.strip()}" ({text.severity}) at {seconds(text.at_s)} ({mode})',
         )
 
 
@@ -129,7 +131,7 @@ def _find_failsafe_mode(armed: ArmedFlight) -> Iterator[Finding]:
     """Find a mode that a failsafe alone chooses."""
     for mode in armed.info.modes:
         if mode.armed and mode.mode in FAILSAFE_MODES:
-            yield Finding(Cause.VEHICLE_FAILSAFE, mode.at_s, f"it went to {mode.mode} at {seconds(mode.at_s)}")
+            yield Finding(Cause.VEHICLE_FAILSAFE, mode.at_s, f"the vehicle went to {mode.mode} at {seconds(mode.at_s)}")
             return
 
 
@@ -137,23 +139,23 @@ def _find_vehicle_silence(armed: ArmedFlight) -> Iterator[Finding]:
     """Find that no heartbeat of the vehicle came for a while, and it was armed before."""
     begun_s, ended_s = _find_first_gap(armed, armed.flight.beat_t_s, _HEARTBEAT_TIMEOUT_S)
     if ended_s > begun_s:
-        text = f"no heartbeat of it came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
+        text = f"no heartbeat came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
         yield Finding(Cause.VEHICLE_SILENT, begun_s, text)
 
 
 def _find_position_loss(armed: ArmedFlight) -> Iterator[Finding]:
-    """Find that the vehicle told no position of its own, or no more, while it was armed."""
+    """Find that the vehicle reported no position of its own, or stopped, while it was armed."""
     own_s = armed.flight.own.t_s
     if not len(own_s):
         invalid = [name for name in armed.info.bad if "position" in name.lower()]
         invalid_text = f" ({', '.join(invalid)})" if invalid else ""
         cause = Cause.POSITIONS_INVALID if invalid else Cause.POSITIONS_ABSENT
-        yield Finding(cause, armed.spans[0][0], f"the vehicle told no valid position of its own{invalid_text}")
+        yield Finding(cause, armed.spans[0][0], f"the vehicle reported no valid position of its own{invalid_text}")
         return
     usual_s = float(np.median(np.diff(own_s))) if len(own_s) > 1 else np.inf
     begun_s, ended_s = _find_first_gap(armed, own_s, max(_HEARTBEAT_TIMEOUT_S, _MAX_PERIODS * usual_s))
     if ended_s > begun_s and not any(_find_vehicle_silence(armed)):
-        text = f"it told none for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
+        text = f"the vehicle reported none for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
         yield Finding(Cause.VEHICLE_POSITION_LOST, begun_s, text)
 
 
@@ -233,8 +235,8 @@ def _find_unusable_stamps(armed: ArmedFlight) -> Iterator[Finding]:
             yield Finding(Cause.STAMPS_UNUSABLE, 0.0, text)
         elif source.positions >= _MIN_POSITIONS and source.delay_ms is not None and source.delay_ms[1] > _MAX_DELAY_MS:
             text = (
-                f"by those of {source.source} positions were up to {seconds(1e-3 * source.delay_ms[2])} late: late, or "
-                "stamped in another unit"
+                f"by their stamps, positions of {source.source} were up to {seconds(1e-3 * source.delay_ms[2])} late: "
+                "delayed, or stamped in another unit"
             )
             yield Finding(Cause.STAMPS_UNUSABLE, 0.0, text)
 
@@ -305,12 +307,12 @@ def _find_track_error(armed: ArmedFlight) -> Iterator[Finding]:
         yield Finding(Cause.OFF_TRACK, errors.worst_s, text)
     elif errors is None:
         yield Finding(
-            Cause.OFF_TRACK, float(at_s[0]), f"it never came nearer to its setpoints than {metres(error_m.min())}"
+            Cause.OFF_TRACK, float(at_s[0]), f"its nearest distance from its setpoints was {metres(error_m.min())}"
         )
 
 
 def _find_mode_exit(armed: ArmedFlight) -> Iterator[Finding]:
-    """Find where it left the mode that takes setpoints for one that is no landing; who asked is not in it."""
+    """Find where it left the mode that takes setpoints for one that is no landing."""
     external = {profile.external_mode for profile in PROFILES.values()}
     landing = {mode for profile in PROFILES.values() for mode in profile.landing_modes}
     failsafe = {Cause.VEHICLE_FENCE, Cause.BATTERY_LOW, Cause.VEHICLE_POSITION_LOST, Cause.VEHICLE_FAILSAFE}
@@ -318,13 +320,13 @@ def _find_mode_exit(armed: ArmedFlight) -> Iterator[Finding]:
         return
     for before, after in pairwise(armed.info.modes):
         if before.armed and after.armed and before.mode in external and after.mode not in landing | external:
-            text = f"from {before.mode} to {after.mode} at {seconds(after.at_s)}; who asked is not in it"
+            text = f"from {before.mode} to {after.mode} at {seconds(after.at_s)}; the requester is unknown"
             yield Finding(Cause.MODE_LEFT, after.at_s, text)
             return
 
 
 def _find_second_vehicle(armed: ArmedFlight) -> Iterator[Finding]:
-    """Find systems that speak as an autopilot does and are not the vehicle that is shown."""
+    """Find systems that send messages of an autopilot and are not the vehicle that is shown."""
     name_parts = (name.rpartition(" of system ") for name in armed.info.messages)
     other_systems = {
         system for message, _, system in name_parts if message in _AUTOPILOT_MESSAGES and system.isdecimal()
@@ -332,12 +334,12 @@ def _find_second_vehicle(armed: ArmedFlight) -> Iterator[Finding]:
     other_systems.discard(str(armed.info.vehicle_system))
     if other_systems:
         subject = f"system{'s' if len(other_systems) > 1 else ''} {', '.join(sorted(other_systems, key=int))}"
-        text = f"{subject} speaks in it, too; this is of system {armed.info.vehicle_system}"
-        yield Finding(Cause.SECOND_VEHICLE, 0.0, text.replace("speaks", "speak") if len(other_systems) > 1 else text)
+        text = f"{subject} also sent autopilot messages; this page shows system {armed.info.vehicle_system}"
+        yield Finding(Cause.SECOND_VEHICLE, 0.0, text)
 
 
 def _describe_mode_exits(info: MavlinkFlightInfo, reported_s: Container[float]) -> Iterator[str]:
-    """Yield where it left a mode that takes setpoints, whoever wanted that, but for the times that are told above."""
+    """Yield exits from modes that take setpoints, but for the times that the findings report."""
     external = {profile.external_mode for profile in PROFILES.values()}
     exits = [
         (before, after)
@@ -345,7 +347,8 @@ def _describe_mode_exits(info: MavlinkFlightInfo, reported_s: Container[float]) 
         if before.armed and before.mode in external and after.mode != before.mode and after.at_s not in reported_s
     ]
     for before, after in exits[:_MAX_MODE_TEXTS]:
-        yield f"It left {before.mode} for {after.mode} at {seconds(after.at_s)}{'' if after.armed else ', disarmed'}."
+        disarmed_text = "" if after.armed else ", disarmed"
+        yield f"The vehicle left {before.mode} for {after.mode} at {seconds(after.at_s)}{disarmed_text}."
 
 
 RULES: tuple[Callable[[ArmedFlight], Iterator[Finding]], ...] = (

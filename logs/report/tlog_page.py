@@ -1,4 +1,4 @@
-"""Page of a flight as its MAVLink or its autopilot tells it: a `.tlog` or a ULog, whoever flew."""
+"""Page of a flight from a `.tlog` or a ULog, with any controller."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def render_tlog_page(flight: MavlinkFlight) -> str:
 def describe_recording(info: MavlinkFlightInfo) -> Iterator[str]:
     """Return what the table does not have, in sentences: what is odd about the recording."""
     if info.vehicle_system is None:
-        yield "No autopilot's heartbeat is in it, so it does not tell what the vehicle did."
+        yield "The recording holds no heartbeat of an autopilot, so it does not show the vehicle's flight."
     yield from (f"{note}." for note in info.notes)
 
 
@@ -228,7 +228,7 @@ SECTIONS: tuple[PageSection[MavlinkFlight], ...] = (
         "Axes over time",
         _draw_axes,
         when=_has_place,
-        note="Time counts from the recording's begin. All is in local NED, height upwards.",
+        note="Time counts from the begin of the recording. Positions are in local NED; height is positive upwards.",
         legend=(*_MARKS, _SETPOINT),
     ),
     PageSection(
@@ -249,10 +249,10 @@ SECTIONS: tuple[PageSection[MavlinkFlight], ...] = (
         "Acceleration setpoints",
         _draw_setpoints,
         when=lambda flight: flight.info.setpoints,
-        empty_text="They ask for no acceleration that changes.",
+        empty_text="The acceleration setpoints are constant.",
     ),
-    PageSection("Modes", _show_modes, empty_text="There are none."),
+    PageSection("Modes", _show_modes, empty_text="There are no acceleration setpoints."),
     PageSection("Texts of the vehicle", _show_texts),
-    PageSection("What is in it", _show_contents),
+    PageSection("Contents", _show_contents),
     PageSection("Summary", _show_summary),
 )

@@ -39,7 +39,7 @@ T = TypeVar("T", bound=_Text)
 
 
 def classify_texts(texts: Iterable[T], get_severity: Callable[[T], Severity]) -> Iterator[tuple[T, Cause]]:
-    """Return the first text of each cause that an armed vehicle's texts tell of.
+    """Return the first text of each cause that an armed vehicle's texts report.
 
     Args:
         texts: Its texts, in their order.
@@ -54,7 +54,7 @@ def classify_texts(texts: Iterable[T], get_severity: Callable[[T], Severity]) ->
 
 
 def classify_text(text: str, severity: Severity) -> Cause | None:
-    """Return the cause that a text of an armed vehicle tells of; None if it tells of none."""
+    """Return the cause that a text of an armed vehicle reports; None if it reports none."""
     if _PREFLIGHT.search(text):
         return None
     cause = next((candidate for pattern, candidate in _PATTERNS if pattern.search(text)), None)

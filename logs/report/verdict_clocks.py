@@ -16,7 +16,7 @@ from uavctl.records import LinkStats, PositionSample, Truth
 
 _MIN_OFFSETS = 3
 
-# Slower than this the true path says nothing of the time. [m/s]
+# Slower than this the true path does not show the time. [m/s]
 _MOVING_MPS = 0.05
 
 
@@ -27,10 +27,10 @@ class ClockVerdict(msgspec.Struct, frozen=True, kw_only=True):
     text: str
     source: str  # "timesync", "minimum" or "none"
     samples: int  # positions that were stamped by it
-    counted: int  # times that the offset was told
+    counted: int  # times that the offset was reported
     offset_s: float | None  # at the end
     drift_ppm: float | None  # what our clock gained on the peer's, by the offsets
-    told_drift_ppm: float | None  # as the synchronisation itself told it at the end
+    told_drift_ppm: float | None  # as the synchronisation reported it at the end
     residual_us: float | None  # of the offsets about a straight line, root mean square
     largest_residual_us: float | None
     rtt_ms: float | None  # median round trip, at the end
@@ -47,7 +47,7 @@ class StampVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def judge_clocks(flight: FlightData) -> tuple[ClockVerdict, ...]:
-    """Judge the clock of each connection that told an offset, in order of their names."""
+    """Judge the clock of each connection that reported an offset, in order of their names."""
     stats_by_link: defaultdict[str, list[LinkStats]] = defaultdict(list)
     for stats in flight.links:
         stats_by_link[stats.link].append(stats)
@@ -98,9 +98,9 @@ def _judge_clock(link: str, rows: list[LinkStats]) -> ClockVerdict:
 
 
 _SOURCES = {
-    "timesync": "by asking the peer (TIMESYNC)",
-    "minimum": "by the quickest arrivals, which cannot tell a constant delay from an offset",
-    "none": "from nothing",
+    "timesync": "by TIMESYNC with the peer",
+    "minimum": "by the quickest arrivals, which cannot separate a constant delay from an offset",
+    "none": "without a source",
 }
 
 
@@ -113,7 +113,7 @@ def format_plain(value: float) -> str:
 def _describe_clock(verdict: ClockVerdict) -> str:
     text = f"The offset of “{verdict.link}” was found {_SOURCES.get(verdict.source, verdict.source)}"
     if verdict.residual_us is None or verdict.drift_ppm is None:
-        return f"{text}; it was told too seldom to judge."
+        return f"{text}; it was reported too seldom to judge."
     round_trip_text = "" if verdict.rtt_ms is None else f"; a round trip took {verdict.rtt_ms:.3g} ms"
     refused_text = f"; {verdict.rejected} answers were refused" if verdict.rejected else ""
     return (

@@ -31,7 +31,7 @@ _DELAY_TOLERANCE_S = 0.002
 # Events by which the controller warns of the link in flight.
 _WARNINGS = frozenset({EventCode.LINK_BURSTS, EventCode.LINK_BELOW_DESIGN})
 _WARNED_TEXT = (
-    " The events' warnings of the link were made in flight, on few steps; this verdict is on all steps flown."
+    " Warnings of the link among the events were made in flight, from few steps. This verdict uses all flown steps."
 )
 
 
@@ -45,7 +45,9 @@ class DelayVerdict(msgspec.Struct, frozen=True, kw_only=True):
     promised_high_ms: float | None
     late: Share | None  # positions that took longer than the longest delay configured
     from_quickest: bool  # capture times are known but for the quickest delay, for which `clock.latency_s` stands
-    latency_ms: float | None = None  # what the quickest one is taken to be; None where the configuration is not known
+    latency_ms: float | None = (
+        None  # delay assumed for the quickest position; None where the configuration is not known
+    )
 
 
 class LinkVerdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -179,32 +181,33 @@ def _is_timed_by_quickest(flight: FlightData) -> bool:
 def _describe_link(verdict: LinkVerdict, is_independent: bool) -> str:
     new_positions = verdict.news
     if not new_positions.trials:
-        return "No step was flown, so nothing is known of the link."
+        return "No step was flown, so the link cannot be judged."
     prefix = (
-        f"News, a position captured within the step, came in {100 * new_positions.rate:.3g} % of "
-        f"{count(new_positions.trials, 'step')}"
+        f"{100 * new_positions.rate:.3g} % of {count(new_positions.trials, 'step')} had a new position, captured "
+        "within the step"
     )
     if verdict.promised_news is None:
-        return f"{prefix}; what was promised is not known any more."
+        return f"{prefix}; the promised share is unknown."
     promised_text = f"{100 * verdict.promised_news:.3g} %"
     if verdict.promised_news == 0.0:
         text = f"{prefix}; the design counts on none."
     elif new_positions.high < verdict.promised_news:
-        text = f"{prefix}, where the design counts on {promised_text}: fewer than promised."
+        text = f"{prefix}. The design counts on {promised_text}: fewer than promised."
     else:
         assessment = (
-            "nothing speaks against it" if new_positions.rate >= verdict.promised_news else "so few may still be chance"
+            "consistent with this flight"
+            if new_positions.rate >= verdict.promised_news
+            else "the difference may be chance"
         )
-        text = f"{prefix}, where the design counts on {promised_text} at least: {assessment}."
+        text = f"{prefix}. The design counts on at least {promised_text}: {assessment}."
     if verdict.bursts and is_independent:
         text += (
-            f" But losses come in bursts (z = {verdict.burst_statistic:.2g}), where the model takes them for "
-            f"independent."
+            f" But losses come in bursts (z = {verdict.burst_statistic:.2g}), and the model assumes independent losses."
         )
     late_share = verdict.delay.late if verdict.delay is not None else None
     if late_share is not None and late_share.hits:
         text += (
-            f" {count(late_share.hits, 'position')} of {late_share.trials} took longer than the longest delay "
-            f"configured."
+            f" {count(late_share.hits, 'position')} of {late_share.trials} took longer than the longest "
+            "configured delay."
         )
     return text

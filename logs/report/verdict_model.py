@@ -74,10 +74,10 @@ _TESTS_PER_AXIS = 3  # mean, spread, whiteness
 class ModelOutcome(StrEnum):
     """Outcome of the tests of a model."""
 
-    HOLDS = "holds"  # nothing speaks against it
+    HOLDS = "holds"  # consistent with the flight
     CAUTIOUS = "cautious"  # errors were smaller than predicted, and that explains all else
     REFUTED = "refuted"  # errors were larger than predicted, off on average, or correlated by more than that
-    UNKNOWN = "unknown"  # too few positions to say
+    UNKNOWN = "unknown"  # too few positions to judge
 
 
 class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -116,7 +116,7 @@ class AxisVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def has_correlated_errors(self) -> bool:
-        """Return whether an error tells of the next, by more than noise predicted too large explains."""
+        """Return whether errors are correlated by more than noise predicted too large explains."""
         has_excess_power = any(power > bound for power, bound in zip(self.power, self.power_bound, strict=True))
         return self.whiteness_refuted and not (self.has_smaller_errors and not has_excess_power)
 
@@ -247,25 +247,25 @@ def _describe_outcome(
     outcome: ModelOutcome, axes: tuple[AxisVerdict, ...], leads: tuple[LeadVerdict, ...], count: int
 ) -> str:
     if not axes:
-        return (
-            f"{count} forecasts of a position in flown time are too few to judge the model; {MIN_ERRORS} are the least."
-        )
+        return f"{count} forecasts of a position while flying are too few to judge the model; it takes {MIN_ERRORS}."
     prefix = f"Over {count} positions"
     departures = "; ".join(_describe_departures(axes))
     if outcome is ModelOutcome.REFUTED:
-        text = f"{prefix} the model is not the vehicle" + (f": {departures}." if departures else " some time ahead.")
+        text = f"{prefix} the vehicle contradicts the model" + (
+            f": {departures}." if departures else " some time ahead."
+        )
     elif outcome is ModelOutcome.CAUTIOUS:
         text = f"{prefix} the model is cautious" + (f": {departures}." if departures else " some time ahead.")
     else:
         text = (
-            f"{prefix} the errors of the forecast are as large as predicted, centred and white: nothing speaks against "
-            "the model."
+            f"{prefix} the errors of the forecast are as large as predicted, centred and white: the model is "
+            "consistent with this flight."
         )
     return f"{text} {_describe_leads(leads)}"
 
 
 def _describe_departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
-    """Return sentences on what departs from the model, and what that means for the flight."""
+    """Return a clause for each departure from the model, with its meaning for the flight."""
     larger = _format_ratios([verdict for verdict in axes if verdict.has_larger_errors])
     smaller = _format_ratios([verdict for verdict in axes if verdict.has_smaller_errors])
     correlated = _format_values(
@@ -278,19 +278,18 @@ def _describe_departures(axes: tuple[AxisVerdict, ...]) -> list[str]:
     biased = _format_values([verdict for verdict in axes if verdict.mean_refuted], lambda verdict: verdict.mean)
     rows = (
         (larger, f"errors are larger than predicted ({larger}), so back-offs are too small"),
-        (smaller, f"errors are smaller than predicted ({smaller}), so back-offs are larger there than they need be"),
+        (smaller, f"errors are smaller than predicted ({smaller}), so back-offs are larger than necessary"),
         (
             correlated,
-            f"an error tells of the next (correlation {correlated}), by more than caution explains: lag, drag, gain or "
-            "times of capture may be wrong",
+            f"successive errors are correlated ({correlated}), by more than caution explains: lag, drag, gain or times "
+            "of capture may be wrong",
         ),
         (
             slightly_correlated,
-            f"an error tells a little of the next (correlation {slightly_correlated}), as it does where a noise is "
-            f"predicted larger "
-            "than it is: slow or quick, errors were not stronger than predicted by more than chance",
+            f"successive errors are slightly correlated ({slightly_correlated}), as expected where a noise is "
+            "predicted too large: at no frequency were errors significantly larger than predicted",
         ),
-        (biased, f"the errors are {biased} deviations off on average"),
+        (biased, f"errors are off on average ({biased}, in predicted deviations)"),
     )
     return [text for axes_named, text in rows if axes_named]
 
@@ -308,11 +307,11 @@ def _format_values(axes: list[AxisVerdict], value: Callable[[AxisVerdict], float
 def _describe_leads(leads: tuple[LeadVerdict, ...]) -> str:
     refuted_leads = [lead for lead in leads if lead.refuted]
     if not leads:
-        return "No stretch was long enough to look ahead."
+        return "No stretch of the flight was long enough to test predictions further ahead."
     longest = leads[-1]
     if not refuted_leads:
         return (
-            f"Looking up to {longest.lead_s:.3g} s ahead, {100 * longest.inside.rate:.3g} % of the positions were in "
+            f"Up to {longest.lead_s:.3g} s ahead, {100 * longest.inside.rate:.3g} % of the positions were in "
             f"their {100 * ELLIPSOID_PROBABILITY:.0f} % ellipsoid ({longest.inside.trials} forecasts)."
         )
     worst = max(refuted_leads, key=lambda lead: abs(lead.inside.rate - lead.promised))

@@ -33,7 +33,7 @@ class LimitRisk(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     promised: float | None  # largest risk; that of all limits of its kind together. None: not known
-    measured: Share  # violations at boundaries with news, under a promise
+    measured: Share  # violations at boundaries with a new position, under a promise
     steps: int  # all flown boundaries
     outside: int  # of these, outside
     p_value: float | None  # of so many violations or more, if the promise holds
@@ -46,7 +46,7 @@ class RiskVerdict(msgspec.Struct, frozen=True, kw_only=True):
     refuted: bool
     text: str
     limits: tuple[LimitRisk, ...]  # all states, all inputs, then each limit of the state
-    unpromised: int  # flown boundaries without a promise: fallback, a plan that gave way, or none before
+    unpromised: int  # flown boundaries without a promise: fallback, a relaxed plan, or no plan before
     source: str  # "truth" or "estimate"
 
 
@@ -120,25 +120,22 @@ def _find_violated_rows(flight: FlightData) -> Flags:
 
 def _describe_risk(limits: list[LimitRisk], refuted_limits: list[LimitRisk], source_text: str) -> str:
     states = limits[0]
-    counts_text = f"{states.measured.hits} of {count(states.measured.trials, 'step')} with news and a promise"
+    counts_text = f"{states.measured.hits} of {count(states.measured.trials, 'step')} with a new position and a promise"
     if not states.measured.trials:
-        return "No step was flown under a promise that news could have tested."
+        return "No flown step had both a promise and a new position to test it."
     if states.promised is None:
-        return (
-            f"The {source_text}state was outside its limits at {counts_text}; what was promised is not known any more."
-        )
+        return f"The {source_text}state was outside its limits at {counts_text}; the promised risk is unknown."
     promised_text = f"{100 * states.promised:.3g} %"
     if refuted_limits:
         first = refuted_limits[0]
         promised_percent = 100 * (first.promised or 0.0)
         return (
-            f"The promise was broken: {first.name} outside at {first.measured.hits} of {first.measured.trials} steps "
-            f"with news, where {promised_percent:.3g} % were promised at most (p = {first.p_value:.2g}). "
-            "Model, link or noise are worse than the design counts on."
+            f"The promise was exceeded: {first.name} outside at {first.measured.hits} of {first.measured.trials} steps "
+            f"with a new position; the design promised at most {promised_percent:.3g} % (p = {first.p_value:.2g}). "
+            "Model, link or noise are worse than the design assumes."
         )
     return (
-        f"The {source_text}state was outside its limits at {counts_text}, where at most {promised_text} were "
-        f"promised: nothing speaks against "
-        f"the promise. One flight can refute a promise, but not prove it; this one leaves any risk up to "
-        f"{100 * states.measured.high:.2g} % possible."
+        f"The {source_text}state was outside its limits at {counts_text}. The design promised at most {promised_text}: "
+        f"consistent with this flight. One flight can refute a promise, but not prove it; this one is consistent with "
+        f"any risk up to {100 * states.measured.high:.2g} %."
     )

@@ -13,7 +13,7 @@ from logs.report.verdict_model import AxisVerdict, LeadVerdict, ModelOutcome, Mo
 from logs.report.verdict_risk import LimitRisk
 from logs.report.verdicts import Verdicts
 
-_UNREADABLE = "The flight's configuration cannot be read by this version, so its model cannot be run again."
+_UNREADABLE = "This version cannot read the flight's configuration, so it cannot run the model again."
 
 
 def make_verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
@@ -31,8 +31,8 @@ def make_verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
 
 def _describe_verdict(is_refuted: bool, is_judged: bool) -> str:
     if not is_judged:
-        return "too little to judge"
-    return "refuted by this flight" if is_refuted else "nothing in this flight speaks against it"
+        return "too few data to judge"
+    return "refuted by this flight" if is_refuted else "consistent with this flight"
 
 
 def _describe_model_verdict(model: ModelVerdict | None) -> str:
@@ -44,11 +44,11 @@ def _describe_model_verdict(model: ModelVerdict | None) -> str:
 
 
 def _describe_departure(model: ModelVerdict) -> str:
-    """Return what refutes a model, each test in a few words."""
+    """Name the tests that refute a model."""
     tests = [
         *(["larger than predicted"] if any(axis_verdict.has_larger_errors for axis_verdict in model.axes) else ()),
         *(["off on average"] if any(axis_verdict.mean_refuted for axis_verdict in model.axes) else ()),
-        *(["telling of the next"] if any(axis_verdict.has_correlated_errors for axis_verdict in model.axes) else ()),
+        *(["correlated"] if any(axis_verdict.has_correlated_errors for axis_verdict in model.axes) else ()),
     ]
     if any(lead.has_too_few_inside for lead in model.leads):
         return ": too few positions were where they were predicted"
@@ -60,15 +60,15 @@ def _show_risk(e: FlightEvidence) -> Iterator[Part]:
     risk = e.judged.verdicts.risk
     limits = [limit for index, limit in enumerate(risk.limits) if index < 2 or limit.outside]
     hidden_count = len(risk.limits) - len(limits)
-    columns = ("limit", "outside", "with news", "risk up to", "promised")
+    columns = ("limit", "outside", "new position", "risk up to", "promised")
     yield risk.text
     yield render_table(columns, map(_make_risk_row, limits), frozenset({1, 2, 3, 4}))
     if hidden_count:
-        yield render_note(f"The other {hidden_count} limits of single states were never broken.")
+        yield render_note(f"The other {hidden_count} limits of single states were never violated.")
     if risk.unpromised:
         yield render_note(
-            f"{risk.unpromised} of {risk.limits[0].steps} flown steps had no promise: it takes a plan that was "
-            "flown in the step before, and in which no constraint gave way."
+            f"{risk.unpromised} of {risk.limits[0].steps} flown steps had no promise. A promise needs a plan "
+            "that was flown in the step before without a relaxed constraint."
         )
 
 
@@ -78,7 +78,9 @@ def _make_risk_row(risk: LimitRisk) -> tuple[str, ...]:
         f"{risk.outside} of {risk.steps}",
         f"{risk.measured.hits} of {risk.measured.trials}",
         _format_percent(risk.measured.high),
-        "unknown" if risk.promised is None else f"{_format_percent(risk.promised)}{', broken' if risk.refuted else ''}",
+        "unknown"
+        if risk.promised is None
+        else f"{_format_percent(risk.promised)}{', exceeded' if risk.refuted else ''}",
     )
 
 
@@ -164,8 +166,8 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
     PageSection(
         "Verdict: promised risk against measured",
         _show_risk,
-        note="“outside” counts all flown steps; “with news” those at which a position had just come, which are "
-        f"independent as far as the promise goes. “risk up to” is the upper end of the exact {100 * LEVEL:.0f} % "
+        note="“outside” counts all flown steps; “new position” counts only steps with a new position, which are "
+        f"independent under the promise. “risk up to” is the upper end of the exact {100 * LEVEL:.0f} % "
         "interval (Clopper and Pearson), all limits together. A promise holds for all limits of the states, or of the "
         "inputs, at once.",
         is_closed=True,
@@ -173,13 +175,13 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
     PageSection(
         "Verdict: the model against what was flown",
         _show_model,
-        note="The flight's filter is run again over all positions it used, in the order of capture. An error is a "
-        "position minus what those before it predict; if the model is right, errors are as large as predicted (1 ×), "
-        "zero on average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is "
-        "predicted for the inputs that were then flown. ✗ refutes the model; ○ departs from it on the cautious side.",
+        note="The flight's filter runs again over all positions that it used, in the order of capture. An error is a "
+        "position minus its prediction from earlier positions. If the model is right, errors are as large as predicted "
+        "(1 ×), zero on average and uncorrelated (white: the p-value of Ljung and Box). Each ellipsoid is predicted "
+        "for the inputs that were flown. ✗ refutes the model; ○ departs from it on the cautious side.",
         legend=(
             Mark("line", "estimate", "measured"),
-            Mark("band", "target", f"where a right model stays with {100 * LEVEL:.0f} %"),
+            Mark("band", "target", f"{100 * LEVEL:.0f} % band of a right model"),
             Mark("dashed", "limit", "promised"),
         ),
         is_closed=True,
@@ -187,7 +189,7 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
     PageSection(
         "Verdict: clocks",
         _show_clocks,
-        note="The age of information is only as true as the times of capture, which come from the clocks of others.",
+        note="The age of information depends on the times of capture, which come from the clocks of the senders.",
         empty_text="No connection reported a clock.",
         is_closed=True,
     ),

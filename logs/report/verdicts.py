@@ -27,7 +27,7 @@ class Verdicts(msgspec.Struct, frozen=True, kw_only=True):
     room: RoomVerdict
     link: LinkVerdict
     model: ModelVerdict | None  # None where the configuration of the flight cannot be read any more
-    clocks: tuple[ClockVerdict, ...]  # one a connection that tells of its clock
+    clocks: tuple[ClockVerdict, ...]  # one for each connection that reports its clock
     stamps: StampVerdict | None  # stamps against the true path; None without one
 
 

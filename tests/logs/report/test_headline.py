@@ -295,4 +295,4 @@ def test_a_recorded_flight_that_was_blown_away_is_told_by_its_positions() -> Non
     truly = {name: sign * true_m[axis] - limit for name, (axis, sign, limit) in WALLS.items()}
     assert wall == max(truly, key=truly.__getitem__) and truly[wall] > 0.5
     assert beyond_m == pytest.approx(truly[wall], abs=0.1)  # by positions, which are a little old
-    assert "no longer believed" in headline.text and headline.tone == BAD
+    assert "no longer used" in headline.text and headline.tone == BAD

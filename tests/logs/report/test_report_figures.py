@@ -72,7 +72,7 @@ def test_small_slack_fills_its_drawing(flight: FlightData, slack: float) -> None
     plans = tuple(msgspec.structs.replace(plan, slack=slack) if plan.seq in two else plan for plan in flight.plans)
     with collect_figures() as figures:
         list(plan_figures.draw_certificates(dataclasses.replace(flight, plans=plans)))
-    low, high = figures["What gave way in plans flown"].axes[0].get_ylim()
+    low, high = figures["Relaxed constraints of flown plans"].axes[0].get_ylim()
     assert low <= 0.0 and slack < high < 2 * slack
 
 

@@ -68,8 +68,8 @@ def test_marks_are_where_things_happened(flight: FlightData) -> None:
     _, times = by_name["orders"].marks
     assert times.tolist() == [1.0]
     silent = sum(bool(d.age_steps) for d in flight.decisions if d.boundary)
-    assert len(by_name["no news"].marks[1]) == silent
-    assert not {"gave way", "no optimum", "outside", "input over", "refused"} & set(by_name)  # nothing of it happened
+    assert len(by_name["no position"].marks[1]) == silent
+    assert not {"relaxed", "no optimum", "outside", "input over", "refused"} & set(by_name)  # nothing of it happened
 
 
 def test_bars_too_short_for_their_text_are_explained(flight: FlightData) -> None:

@@ -230,7 +230,7 @@ def test_the_main_thing_comes_first(
     assert path.with_suffix(".html").read_text(encoding="utf-8").index(banner) > 0
     assert ("positions-apart" in told["headline"]["causes"]) is ("off_m" in given)
     if given.get("armed", True):
-        assert "It left GUIDED for LAND at 11.0 s." in told["headline"]["why"]
+        assert "The vehicle left GUIDED for LAND at 11.0 s." in told["headline"]["why"]
     assert run(["log", "report", str(path)]) == 0
     assert " ".join(capsys.readouterr().out.split()).startswith(told["headline"]["text"][:60])
     assert run(["log", "info", str(path), "--json"]) == 0

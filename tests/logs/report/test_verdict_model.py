@@ -51,7 +51,7 @@ def test_errors_that_tell_of_the_next_are_found() -> None:
     assert [axis_verdict.correlation[0] for axis_verdict in verdict.axes] == pytest.approx([0.4] * 3, abs=0.1)
     assert len(verdict.axes[0].correlation) == LAGS
     assert verdict.refuted
-    assert "error tells of the next" in verdict.text
+    assert "errors are correlated" in verdict.text
     assert all(
         f"{axis_verdict.correlation[0]:.2g} {axis_verdict.axis}" in verdict.text for axis_verdict in verdict.axes
     )
@@ -72,12 +72,12 @@ def test_errors_that_are_off_are_found() -> None:
     values[:, 1] += 0.3
     verdict = judge_innovations(errors(values), AXES, 0.2)
     assert [axis_verdict.mean_refuted for axis_verdict in verdict.axes] == [False, True, False]
-    assert "east deviations off on average" in verdict.text
+    assert " east, in predicted deviations" in verdict.text
 
 
 def test_figures_below_zero_have_a_minus_as_elsewhere() -> None:
     text = judge_innovations(errors(np.random.default_rng(3).standard_normal((400, 3)) - 0.5), AXES, 0.2).text
-    assert "errors are −0." in text and "errors are -" not in text
+    assert "(−0." in text and "(-" not in text
 
 
 def test_a_few_positions_are_too_few() -> None:
