@@ -1,4 +1,4 @@
-"""One small tree of errors; each message says what is wrong, where, and what to do."""
+"""One small tree of errors; each message holds the place, the reason and the remedy."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class ConnectionClosedError(UavctlError):
 
 
 class NotReadyError(UavctlError):
-    """The vehicle must not be armed as things are; names every item that speaks against it."""
+    """The vehicle must not be armed as things are; names every failed item."""
 
 
 class RecordingError(UavctlError):
@@ -103,11 +103,11 @@ class TickOverdueError(BaseException):
 
 # What code of other packages may raise, where nothing that it does may end a flight or a campaign.
 RAISED = (Exception, SystemExit, GeneratorExit)
-LONGEST_WORDS = 500  # of what an error says [characters]
+LONGEST_WORDS = 500  # of an error's text [characters]
 
 
 def in_words(error: BaseException, longest: int = LONGEST_WORDS) -> str:
-    """Return an error of any code on one line: its type, and what it says as far as it can."""
+    """Return an error of any code on one line: its type and its text, as far as there is one."""
     try:
         said = str(error)[:longest]
     except RAISED:

@@ -148,7 +148,7 @@ source.onmessage = (message) => {
   while (ages.length && ages[0][0] < scene.time_s - MINUTE_S) ages.shift();
   draw();
 };
-// A state that is old looks like a vehicle that stands still, so the page says that it is.
+// An old state looks like a vehicle at rest, so the page marks it as old.
 setInterval(() => {
   if (heard && Date.now() - heard > 1000) {
     const head = byId("headline");

@@ -59,7 +59,7 @@ def check_request(request: Request, token: str) -> None:
 
     Host is the name by which the browser knows the server: another site may let its own name lead to this machine.
     Origin is the site whose page asks; programs that are no browsers send none. A browser sends none either where the
-    page cannot read the answer, as of a picture; such a page could take all places. Sec-Fetch-Site tells it.
+    page cannot read the answer, as of a picture; such a page could take all places. Sec-Fetch-Site shows the origin.
 
     Args:
         token: A WebSocket with this path may be opened by the page of any site, as its user has entered the token.

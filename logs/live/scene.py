@@ -108,7 +108,7 @@ class FlightScene:
                 self._design = None  # the page then draws no limits
 
     def scene(self) -> LiveScene | None:
-        """Return what is to be seen now; None before the first decision."""
+        """Return the scene of the newest records; None before the first decision."""
         decision, design = self._get(Decision), self._design
         header, estimate, plan, truth = self._get(Header), self._get(Estimate), self._get(Plan), self._get(Truth)
         if decision is None or header is None:
@@ -149,20 +149,20 @@ class FlightScene:
         vehicle, setpoint = self._get(VehicleStatus), self._get(Setpoint)
         link, timing = self._get(LinkEstimate), self._get(Timing)
         if vehicle is None:
-            yield SceneFigure("vehicle", "not heard yet", "warn")
+            yield SceneFigure("vehicle", "no heartbeat yet", "warn")
         else:
             armed = "armed" if vehicle.armed else "disarmed"
             yield SceneFigure("vehicle", f"{vehicle.mode}, {armed}", "bad" if vehicle.failsafe else "plain")
             if vehicle.battery_v is not None:
                 yield SceneFigure("battery", f"{vehicle.battery_v:.1f} V")
         if link is not None and link.below_promise:
-            yield SceneFigure("positions", "fewer in time than counted on", "warn")
+            yield SceneFigure("positions", "fewer in time than the design counts on", "warn")
         if setpoint is not None:
             accel_text = ", ".join(f"{value:+.2f}" for value in setpoint.accel_mps2)
             limited = f" (limited: {', '.join(setpoint.limited)})" if setpoint.limited else ""
             yield SceneFigure("setpoint N, E, D [m/s²]", accel_text + limited, "warn" if limited else "plain")
         if plan is not None:
-            relaxed_text = f", gave way by {plan.slack:.2g}" if plan.gave_way else ""
+            relaxed_text = f", relaxed by {plan.slack:.2g}" if plan.gave_way else ""
             yield SceneFigure(
                 "plan", f"{plan.status.value}, {plan.method}{relaxed_text}", "warn" if relaxed_text else "plain"
             )

@@ -34,10 +34,10 @@ def make_handshake(request: Request, subprotocols: tuple[str, ...]) -> bytes:
     """Return the answer that turns a connection into a WebSocket.
 
     Args:
-        subprotocols: Those that the server speaks, the best first.
+        subprotocols: Those that the server supports, the best first.
 
     Raises:
-        RequestRefusedError: The client speaks none of them, or another version.
+        RequestRefusedError: The client supports none of them, or another version.
     """
     key = request.headers.get("sec-websocket-key")
     offered = [name.strip() for name in request.headers.get("sec-websocket-protocol", "").split(",")]

@@ -128,7 +128,7 @@ WIRE_TOLERANCE = float(np.finfo(np.float32).eps)
 SLACK_TOLERANCE = 1e-6
 SETTLED_SHARE = 0.25
 ARRIVED_M = 0.3  # from the target: as near as `mission.accept_m` asks for, unless it is configured otherwise
-BLIND_S, BLIND_STEPS = 0.5, 2.0  # without a position for longer, what is told of the place is a prediction
+BLIND_S, BLIND_STEPS = 0.5, 2.0  # without a position for longer, the reported place is a prediction
 
 
 class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -154,7 +154,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     fallbacks: int  # entries into braking, holding or landing that nobody wanted
     state_violations: int  # flown boundaries with the state outside its set
     input_violations: int  # flown boundaries with the input outside its set
-    slack_used: int  # flown plans in which a constraint or the terminal equality gave way
+    slack_used: int  # flown plans with a relaxed constraint or a missed terminal equality
     cost: float  # sum over flown boundaries of (x-x_target)'Q(x-x_target) + u'Ru, with the target of the moment
     recording: str | None
     report: str | None
@@ -199,7 +199,7 @@ def summarise(
     """Compute the figures of a flight.
 
     `recording` and `report` are paths as the user should see them; `wall_s` is None for a flight of another day, and so
-    is `ending`, which the recording tells then.
+    is `ending`, which the recording then holds.
     """
     if ending is None:
         ending = report_lost_records(find_ending(flight), recorder_dropped, "")

@@ -226,7 +226,7 @@ def test_armed_and_in_the_air_are_told() -> None:
 @pytest.mark.parametrize(
     ("periods_ms", "told", "wanted_state"),
     [
-        ([], "not told", ItemState.NOTE),
+        ([], "not reported", ItemState.NOTE),
         ([100], "10 Hz", ItemState.GOOD),
         ([300, 300, 300], "3.33 Hz", ItemState.GOOD),
         ([400, 400, 100], "2.5 Hz", ItemState.NOTE),

@@ -72,7 +72,7 @@ def _check_vehicle_position(data: CheckData, pairs: list[tuple[Vec3, Vec3]]) -> 
     if len(pairs) >= MIN_PAIRS:
         distance_m = np.linalg.norm(np.median([np.subtract(e, v) for e, v in pairs], axis=0))
         return make_item(name, ItemState.GOOD, f"{len(pairs)} pairs, {distance_m:.2f} m from the cameras'", want)
-    flags = "not told" if data.estimator is None else f"flags 0x{data.estimator:x}"
+    flags = "not reported" if data.estimator is None else f"flags 0x{data.estimator:x}"
     hint = (
         "give its estimator positions (the vehicle's parameters, [relay]); meanwhile `uavctl check --move` shows axes"
     )
@@ -183,10 +183,10 @@ def _check_heading(data: CheckData, config: Config) -> tuple[Item, bool]:
     want = f"the cameras' attitude within {limit_deg:g} deg of the vehicle's own"
     rotations = _compute_relative_attitudes(data)
     if not rotations:
-        value = "the source tells none, or exactly level to the north"
+        value = "the source sends none, or exactly level to the north"
         hint = "let the source send the body's attitude: it shows a turned frame at rest"
         if _has_attitude(data):
-            value, hint = "the vehicle tells none", "let the vehicle stream ATTITUDE on this link"
+            value, hint = "the vehicle reports none", "let the vehicle stream ATTITUDE on this link"
         return make_item(name, ItemState.UNDETERMINED, value, want, hint), False
     yaws = [euler_from_quaternion(q)[2] for q in rotations]
     # Mean of directions: angles near 180 deg must not average to 0.
@@ -196,7 +196,7 @@ def _check_heading(data: CheckData, config: Config) -> tuple[Item, bool]:
     )
     value = f"{yaw:.1f} deg apart about the vertical, {tilt:.1f} deg in tilt"
     if tilt > _TILT_DEG:
-        hint = "the cameras' axes point up where [frame] says down, or the body was defined lying otherwise"
+        hint = "the cameras' axes point up where [frame] has them down, or the body was defined in another attitude"
         return make_item(name, ItemState.BAD, value, want, hint), False
     if abs(yaw) > limit_deg:
         hint = (

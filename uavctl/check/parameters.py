@@ -314,6 +314,6 @@ def _check_parameter(rule: Rule, get: ParameterGetter, config: Config) -> Item:
     value = get(rule.name)
     if value is None:
         hint = "it was asked for several times; does this version have it, and does the link carry our messages?"
-        return make_item(rule.name, ItemState.UNDETERMINED, "not told", "its value, to judge it", hint)
+        return make_item(rule.name, ItemState.UNDETERMINED, "not reported", "its value, to judge it", hint)
     verdict = rule.judge(value, get, config)
     return make_item(rule.name, verdict.state, f"{value:g}", verdict.want, verdict.hint or rule.hint)

@@ -22,9 +22,7 @@ def check_vehicle(data: CheckData, config: Config, at_ns: int, take_off_m: float
     heartbeat = data.heartbeat
     want = "heartbeats of PX4 or ArduPilot, about one a second"
     if heartbeat is None:
-        hint = (
-            f"is the vehicle on, and does it speak at {config.daemon.vehicle}? See --vehicle, and its telemetry ports"
-        )
+        hint = f"is the vehicle on, and does it send to {config.daemon.vehicle}? See --vehicle, and its telemetry ports"
         return [make_item("vehicle", ItemState.BAD, "no heartbeat", want, hint)]
     return [
         _check_identity(data, at_ns, want),
@@ -45,10 +43,10 @@ def _check_identity(data: CheckData, at_ns: int, want: str) -> Item:
     value = f"{name}{version}, system {data.heartbeat.system}"
     if kind not in _NAMES:
         return make_item(
-            "vehicle", ItemState.BAD, value, want, "its modes are not known, so its setpoint mode cannot be told"
+            "vehicle", ItemState.BAD, value, want, "its modes are not known, so its setpoint mode is unknown"
         )
     if silent_s > _MAX_SILENCE_S:
-        return make_item("vehicle", ItemState.BAD, f"{value}, silent for {silent_s:.1f} s", want, "see to the link")
+        return make_item("vehicle", ItemState.BAD, f"{value}, silent for {silent_s:.1f} s", want, "check the link")
     return make_item("vehicle", ItemState.GOOD, value, want)
 
 
@@ -79,25 +77,25 @@ def _check_armed(data: CheckData, *, takes_off: bool) -> Item:
 
 
 def _check_landed(data: CheckData) -> Item:
-    value = {None: "not told", True: "on the ground", False: "in the air"}[data.landed]
+    value = {None: "not reported", True: "on the ground", False: "in the air"}[data.landed]
     state = ItemState.GOOD if data.landed else ItemState.NOTE
     hint = (
         "a flight with --arm --takeoff begins on the ground"
         if data.landed is False
-        else "what it does not tell cannot be waited for"
+        else "a flight cannot wait for a state that the vehicle does not report"
     )
     return make_item("landed", state, value, "on the ground", hint)
 
 
 def _check_velocity_rate(data: CheckData) -> Item:
-    """Whether positions can be held against the vehicle's own velocity in flight."""
-    want = f"LOCAL_POSITION_NED at {1e9 / MOTION_NS:.2g} Hz or more, for positions to be held against it in flight"
+    """Return whether positions can be compared with the vehicle's own velocity in flight."""
+    want = f"LOCAL_POSITION_NED at {1e9 / MOTION_NS:.2g} Hz or more, to compare positions with it in flight"
     hint = (
-        "without it a turned or mirrored frame is found later in flight, and one that creeps is not; "
-        "see to the vehicle's streams, and to its estimator"
+        "without it a turned or mirrored frame is found later in flight, and a slow drift is not; "
+        "check the vehicle's streams and its estimator"
     )
     if len(data.vehicle_positions) < 2:
-        return make_item("own velocity", ItemState.NOTE, "not told", want, hint)
+        return make_item("own velocity", ItemState.NOTE, "not reported", want, hint)
     period_ns = median(b - a for (a, _), (b, _) in pairwise(data.vehicle_positions))
     state = ItemState.GOOD if period_ns <= MOTION_NS else ItemState.NOTE
     return make_item("own velocity", state, f"{1e9 / period_ns:.3g} Hz", want, hint)
@@ -107,7 +105,7 @@ def _check_battery(data: CheckData, config: Config) -> Item:
     min_v = config.check.battery_v
     want = f"at least {min_v:g} V (check.battery_v)" if min_v else "check.battery_v is not set"
     if data.battery_v is None:
-        return make_item("battery", ItemState.UNDETERMINED, "not told", want, "see to the vehicle's battery monitor")
+        return make_item("battery", ItemState.UNDETERMINED, "not reported", want, "check the vehicle's battery monitor")
     value = f"{data.battery_v:.2f} V"
     return judge_item(
         "battery", is_good=data.battery_v >= min_v, value=value, want=want, hint="charge it, or change it"

@@ -88,7 +88,7 @@ def render_trials(result: CampaignResult[TrialSummary]) -> RenderableType:
     places = [cell.place for cell in result.cells]
     refused = [f"{place.controller}, {place.link}: {place.refused}" for place in places if place.refused]
     failed = sum(cell.failed for cell in result.cells)
-    remarks = [f"{failed} flights failed; runs.parquet says why"] if failed else []
+    remarks = [f"{failed} flights failed; runs.parquet holds the reasons"] if failed else []
     return Group(*tables, *_format_closing(result, refused, [*remarks, FIGURE_NOTE]))
 
 

@@ -170,7 +170,7 @@ _STYLES = {
 
 _MAX_WIDTH = 80  # columns
 _LABEL_WIDTH = 14  # columns for the longest state and a blank
-_PERMISSIONS = "see to cable, port, permissions (serial ports: group dialout), or another program that has it"
+_PERMISSIONS = "check cable, port, permissions (serial ports: group dialout), or another program that has it"
 
 
 class CheckReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -195,9 +195,9 @@ def check(
     seed: RiskSeed = 0,
     out: Annotated[Path, Parameter(help="folder that recordings will be written to")] = Path("flights"),
 ) -> int:
-    """Look at rates, ages, frames, clocks, the vehicle's parameters and the disk; arms nothing.
+    """Check rates, ages, frames, clocks, the vehicle's parameters and the disk; arms nothing.
 
-    Exit code 0: nothing speaks against flying. What could not be determined is told, and does not fail the check.
+    Exit code 0: no item fails. Items that could not be determined are listed, and do not fail the check.
     """
     overrides = make_key_overrides(
         daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds, check__rehearsals=rehearsals
@@ -222,7 +222,7 @@ def check(
         items.append(
             make_item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS)
         )
-    # Last, as it takes seconds: a wrong URL is told at once.
+    # Last, as it takes seconds: a wrong URL is reported at once.
     with locate_design_errors(loaded):
         items += make_flight_items(config, seed=seed)
     report = CheckReport(ok=not find_refusals(items, config.check), items=tuple(items))
@@ -301,7 +301,7 @@ def make_disk_items(folder: Path, free_bytes: int) -> list[Item]:
 
 def _make_stranger_item(texts: tuple[str, ...]) -> Item:
     state = ItemState.NOTE if texts else ItemState.GOOD
-    value, hint = ". ".join(texts) or "none can speak", "see docs/security.md"
+    value, hint = ". ".join(texts) or "none can send", "see docs/security.md"
     return make_item("strangers", state, value, "known peers, and signed frames", hint)
 
 

@@ -82,7 +82,7 @@ for _name, _help in _ORDERS.items():
 
 @ctl_app.command(help_epilogue=format_example("ctl status"))
 def status(*, choice: DaemonChoice = ANY_DAEMON) -> int:
-    """Say how the flight is doing. Exit code 1: no daemon answers."""
+    """Show the state of the flight. Exit code 1: no daemon answers."""
     reply = send_request(ControlRequest(ask="status"), find_control_folder(choice.control), choice.vehicle)
     if reply.status is None:
         raise NotReachedError(f"the daemon gave no status: {reply.text}; is it of this version?")

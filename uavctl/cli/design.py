@@ -69,7 +69,7 @@ def _render_gains(comparison: GainComparison, name: str) -> RenderableType:
 
 _INFEASIBLE_NOTE = (
     "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
-    "way of nearer equilibria, or gives way where the limits are soft."
+    "way of nearer equilibria, or relaxes soft limits."
 )
 
 
@@ -260,7 +260,7 @@ def make_solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
     """Return the answer for --json; infinite values (no plan, no lower bound) are null."""
     document: dict[str, object] = msgspec.to_builtins(answer, enc_hook=lambda array: array.tolist())
     del document["seq"]
-    document["gave_way"] = document.pop("relaxed")  # the key that it has in recordings, too
+    document["gave_way"] = document.pop("relaxed")  # the key in recordings, too
     return {**document, "solve_us": solve_us}
 
 

@@ -172,7 +172,7 @@ def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[Conf
 
 @fleet_app.command(help_epilogue=format_example("fleet check"))
 def check(file: File, /, *, json: QuietJson = False) -> int:
-    """Say whether a fleet can be flown: its configurations, links, and how far apart its boxes are; sends nothing."""
+    """Check whether a fleet can be flown: its configurations, links, and how far apart its boxes are; sends nothing."""
     fleet = read_fleet(file)
     document = {
         "vehicles": [
@@ -237,7 +237,7 @@ def fly(
 def status(
     file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None, json: QuietJson = False
 ) -> int:
-    """Say how all vehicles of a file are doing, in one table. Exit code 1: not all daemons answer."""
+    """Show the state of all vehicles of a file in one table. Exit code 1: not all daemons answer."""
     fleet, folder = read_fleet(file), find_control_folder(control)
     health = {member.name: _read_health(member, folder) for member in fleet.members}
     Common(json=json).show("fleet/status", {"vehicles": health}, lambda: _make_status_table(health))

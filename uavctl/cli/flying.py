@@ -73,7 +73,7 @@ def check_take_off(arm: bool, takeoff: float | None) -> float | None:
     if arm and takeoff is None:
         raise UsageError("--arm needs --takeoff HEIGHT: on the ground nothing else can be done with an armed vehicle")
     if takeoff is not None and not arm:
-        raise UsageError("--takeoff needs --arm: say that the vehicle may be armed")
+        raise UsageError("--takeoff needs --arm: it permits arming the vehicle")
     return takeoff
 
 
@@ -211,7 +211,7 @@ def record_failure(loop: ControlLoop) -> Iterator[None]:
     except UavctlError as error:
         loop.account.control_error = in_words(error)
         raise
-    except (Exception, TickOverdueError) as error:  # noqa: BLE001 the flight is over, and its ending says how
+    except (Exception, TickOverdueError) as error:  # noqa: BLE001 the flight is over; its ending holds the cause
         loop.account.control_error = in_words(error)
         sys.stderr.write(format_exc())
 

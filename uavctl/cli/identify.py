@@ -41,7 +41,7 @@ def identify_command(
 ) -> int:
     """Identify the vehicle and the link of a flight, and write them as a configuration with a page of plots.
 
-    A recording of ours brings its configuration along; for a `.tlog`, --config and --set say which messages are
+    A recording of ours brings its configuration along; for a `.tlog`, --config and --set define which messages are
     positions and in what frame. Plant, link, rate and noise of that configuration are replaced, all else is kept.
     """
     history, config = _read_history(flight, common, system)

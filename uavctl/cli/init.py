@@ -31,7 +31,7 @@ _AXES = ("length", "width", "height")
 
 _TEXT = """\
 # A room of {length:g} x {width:g} x {height:g} m (north x east x up), and a vehicle under {autopilot}.
-# `uavctl design --config {file}` says what it allows,
+# `uavctl design --config {file}` shows the design,
 # `uavctl loopback --config {file}` flies it in simulation.
 # Every other key is that of the base; `uavctl docs configuration` has them all.
 base = "{base}"

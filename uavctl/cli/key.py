@@ -33,7 +33,7 @@ def new(
 
 @key_app.command(help_epilogue=format_example("key show"))
 def show(file: Annotated[Path, Parameter(help="file to read")], *, json: Json = False) -> int:
-    """Say which key a file holds: equal names are equal keys. Nothing of the key itself is shown."""
+    """Show the name of the key in a file: equal names are equal keys. Nothing of the key itself is shown."""
     return _show_key(file, read_key(file).name, json=json)
 
 

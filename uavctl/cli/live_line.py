@@ -61,7 +61,7 @@ class MessageFilter:
             del self._shown_ns[min(self._shown_ns, key=lambda text: self._shown_ns[text])]
         self._shown_ns[event.text] = event.at_ns
         awaited = describe_wait(state)
-        text = f'the vehicle says: "{event.text}"' if event.code == VEHICLE_TEXT else event.text
+        text = f'the vehicle reports: "{event.text}"' if event.code == VEHICLE_TEXT else event.text
         return f"{text} (waiting for {awaited})" if awaited else text
 
 
@@ -125,7 +125,7 @@ def show_live_line(
 
         def refresh() -> None:
             while not done.wait(REFRESH_S):
-                with suppress(Exception):  # no memory, say: the next line tries again
+                with suppress(Exception):  # such as no memory: the next line tries again
                     show()
 
         def show() -> None:

@@ -168,7 +168,9 @@ def _describe_parameters(parameters: Mapping[str, VehicleParameter], count: int 
     shown = ", ".join(f"{name} {parameter.value}" for name, parameter in [*parameters.items()][:_SHOWN_PARAMETERS])
     ellipsis = "" if len(parameters) <= _SHOWN_PARAMETERS else " ...; --json has all"
     number = count_parameters(parameters)
-    missing = "" if count is None or number >= count else f"; INCOMPLETE: {number} of the {count} that it says it has"
+    missing = (
+        "" if count is None or number >= count else f"; INCOMPLETE: {number} of the {count} that the vehicle reports"
+    )
     yield f"vehicle parameters: {len(parameters)} ({shown}{ellipsis}){missing}"
 
 
@@ -177,7 +179,7 @@ def _describe_loss(loss: PositionLoss) -> Iterator[str]:
         bursts = ", lost in bursts" if loss.bursts else ""
         promise_text = ", fewer than promised" if loss.below_promise else ""
         share = f"{100 * (1.0 - loss.believed):.0f} % of the steps"
-        yield f"positions: {share} had one captured within them, as last estimated{promise_text}{bursts}"
+        yield f"positions: {share} had a new one by the last estimate{promise_text}{bursts}"
     if loss.simulated_sent:
         yield f"simulated channel: {loss.simulated_lost} of {loss.simulated_sent} positions lost"
 
@@ -195,7 +197,7 @@ _COMMANDS = {
         "replay:replay",
         """Drive the recorded inputs through the same control loop and compare all that it decides.
 
-        Somebody else's flight (a `.tlog`, or an MCAP with raw MAVLink in it) goes through parser, clock offset,
+        Another program's flight (a `.tlog`, or an MCAP with raw MAVLink in it) goes through parser, clock offset,
         estimator and controller of `--config`. With `--set KEY=VALUE` a recording of ours is replayed with that key
         changed: what the changed controller would have decided of the same inputs, from the first decision that
         differs on.
@@ -214,7 +216,7 @@ _COMMANDS = {
         """Fly a recorded flight again with something changed, in the same disturbance, and compare.
 
         The recorded inputs of the control loop come again at their times; positions are moved by as much as the
-        vehicle, by its model, would have been elsewhere. docs/what-if.md says what that can tell, and what not.
+        vehicle, by its model, would have been elsewhere. docs/what-if.md shows its limits.
         """,
     ),
     "export": (
@@ -222,7 +224,7 @@ _COMMANDS = {
         """Write a recording as tables (CSV, or Parquet with uavctl[parquet]), or its raw MAVLink as a .tlog.
 
         One table for each topic of records. Topics made for viewers (/view, /plot) are left out: they hold nothing
-        that the records do not. docs/recordings.md says what the columns are.
+        that the records do not. docs/recordings.md describes the columns.
         """,
     ),
 }
@@ -235,7 +237,7 @@ for _name, (_path, _help) in _COMMANDS.items():
 
 @log_app.command(help_epilogue=format_example("log info"))
 def info(flight: Flight, /, *, system: System = None, json: Json = False) -> int:
-    """Say what a recording, a .tlog or a ULog holds: the page's first line, topics, rates, gaps, losses, its making."""
+    """Show a recording, a .tlog or a ULog: the page's first line, topics, rates, gaps, losses, origin."""
     from logs.report import headline, tlog_headline  # loads SciPy, so only for this command
 
     if detect_kind(flight) is not FileKind.MCAP or system is not None:

@@ -86,6 +86,8 @@ def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Comm
         packets, lambda sink: ControlLoop(config, controller, sink, lambda: 0), link=VEHICLE, tick_ns=tick_ns
     )
     if not result.positions:
-        raise UsageError(f"{flight}: no external position in it (source.messages says which messages count)")
+        raise UsageError(
+            f"{flight}: no external position in the recording (source.messages lists the accepted messages)"
+        )
     common.show("log/replay-foreign", result, lambda: make_foreign_table(result, config.smpc.horizon))
     return 0

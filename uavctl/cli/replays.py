@@ -116,8 +116,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         loaded = parse_recorded(recorded.config_toml, name, overrides)
         if make_links(loaded.config).keys() != make_links(config).keys():
             raise UsageError(
-                "daemon.vehicle and daemon.mocap say over which connections the recorded bytes came; leave them as "
-                "they are"
+                "daemon.vehicle and daemon.mocap name the connections of the recorded bytes; leave them as they are"
             )
         controller = make_changed_controller(loaded).controller
         changed = tuple(_find_changes(msgspec.to_builtins(config), msgspec.to_builtins(loaded.config), ""))

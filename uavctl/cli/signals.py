@@ -69,7 +69,7 @@ def ignore_stopping_signals() -> Iterator[None]:
 
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Yield a function that says whether a signal has asked for the end.
+    """Yield a function that returns whether a signal has asked for the end.
 
     A second deliberate signal raises in the main thread. The system ends the process if that takes too long.
     """

@@ -53,7 +53,7 @@ def sim(
         ),
     ] = "udpout://127.0.0.1:14560",
     autopilot: Annotated[
-        Literal["px4", "ardupilot"] | None, Parameter(help="whose behaviour it shows; else sim.autopilot")
+        Literal["px4", "ardupilot"] | None, Parameter(help="autopilot that it simulates; else sim.autopilot")
     ] = None,
     airborne: Annotated[bool, Parameter(negative=(), help="start flying in OFFBOARD or GUIDED")] = False,
     duration: Annotated[
@@ -86,7 +86,7 @@ def sim(
         ),
     ] = False,
 ) -> int:
-    """Serve simulated vehicles; a line for each (one document with --json) says when all ports are open."""
+    """Serve simulated vehicles; a line for each (one document with --json) appears when all ports are open."""
     overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)
     loaded = common.with_overrides(overrides).load()
     config = loaded.config

@@ -153,7 +153,7 @@ def _chooses_plant(common: Common) -> bool:
     try:
         text = read_text(path)
     except DataFileError:
-        return False  # the loader says what is wrong
+        return False  # the loader reports the error
     sim = parse_toml(text, str(path)).get("sim")
     return isinstance(sim, dict) and "plant" in sim
 

@@ -84,7 +84,7 @@ def whatif(
     controller: Annotated[
         str,
         Parameter(
-            help=f"who flies: {', '.join(KINDS)}; or a controller of another package, by its entry point "
+            help=f"controller: {', '.join(KINDS)}; or a controller of another package, by its entry point "
             "uavctl.controllers or as module:Class"
         ),
     ] = "smpc",
@@ -93,7 +93,7 @@ def whatif(
         Parameter(
             negative=(),
             metavar="recorded|configured|KEY=VALUE",
-            help="how positions come: as recorded; over a simulated link as [link] says; or over that with a key of it "
+            help="how positions come: as recorded; over a simulated link as in [link]; or over that with a key of it "
             "changed, as in loss=0.5, which the design does not know; may be repeated. Else as recorded, unless --set "
             "changes a key of link",
         ),
@@ -110,7 +110,7 @@ def whatif(
     """Fly a recorded flight again with something changed, in the same disturbance, and compare."""
     if (detect_kind(flight) is FileKind.TLOG and flight.exists()) or is_foreign(flight):
         raise UsageError(
-            f"{flight} is another program's recording: it does not tell what was decided; `uavctl log replay` and "
+            f"{flight} is another program's recording: it holds no decisions; `uavctl log replay` and "
             "`uavctl identify` read it"
         )
     link_name = _choose_link(link, overrides)

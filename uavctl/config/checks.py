@@ -82,7 +82,7 @@ def check_mission(plant: PlantConfig, sets: SetsConfig, mission: MissionConfig) 
         yield ConfigProblem(
             "mission.then",
             '"land" has no end to come after: the target is held',
-            "give waypoints or a trajectory; one waypoint with a hold_s will do",
+            "give waypoints or a trajectory; one waypoint with a hold_s is enough",
         )
     yield from _check_yaw(plant, mission)
     hold_times = mission.hold_s if isinstance(mission.hold_s, tuple) else (mission.hold_s,)
@@ -273,8 +273,8 @@ def _check_plant(plant: PlantConfig) -> Iterator[ConfigProblem]:
     if plant.model == "matrices" and {*missing} >= {*_AXIS_KEYS}:  # only the meaning of the states is missing
         yield ConfigProblem(
             "plant.axes",
-            f"is given without {', '.join(_AXIS_KEYS)}, which say how the plant moves along them",
-            "add them, or remove plant.axes: then the plant is planned for and simulated, and flies nowhere",
+            f"is given without {', '.join(_AXIS_KEYS)}, which define the motion along them",
+            "add them, or remove plant.axes: then the plant can be planned for and simulated, but not flown",
         )
         return
     for key in missing:
@@ -403,7 +403,7 @@ def _check_schedule(plant: PlantConfig, smpc: SmpcConfig, schedule: ScheduleConf
         if any(delay < 1 for delay in (delays if isinstance(delays, tuple) else (delays,))):
             yield ConfigProblem(
                 "schedule.delays",
-                "a delay is below 1 step: feedback on what has not happened yet",
+                "a delay is below 1 step: feedback on a future state",
                 'give whole numbers >= 1, or rule = "search" or "greedy"',
             )
     if schedule.rule == "search" and not schedule.search_states:

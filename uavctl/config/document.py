@@ -328,7 +328,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 @dataclass(frozen=True)
 class Source:
-    """Origin of a configuration: enough to say where each key stands."""
+    """Origin of a configuration: enough to locate each key."""
 
     file: str  # the file, as a person finds it
     lines: Mapping[str, int]  # key path -> line in the file

@@ -269,7 +269,7 @@ def _expand_base_and_room(
         head, _, inner = key.partition(".")
         value = document.get(head)
         if value is not None and (not inner or (isinstance(value, dict) and inner in value)):
-            reason = f"is given, and [room] in line {lines.get('room', 1)} says it by name"
+            reason = f"is given, and [room] in line {lines.get('room', 1)} sets it by name"
             problems.append(ConfigProblem(key, reason, "keep one of the two"))
     if len(problems) == problem_count:
         written: dict[str, str] = {}

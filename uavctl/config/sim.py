@@ -220,7 +220,7 @@ def check_sim(config: SimConfig) -> Iterator[ConfigProblem]:
 
 
 def check_system_ids(sim: SimConfig, daemon: DaemonConfig) -> Iterator[ConfigProblem]:
-    """Check that the simulated vehicle and the daemon have different system ids, to be told apart on one link."""
+    """Check that the simulated vehicle and the daemon have different system ids, to be distinguished on one link."""
     if sim.system_id == daemon.system_id:
         yield ConfigProblem(
             "sim.system_id", f"{sim.system_id} is that of the daemon too (daemon.system_id)", "give another number"

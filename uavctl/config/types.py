@@ -102,7 +102,7 @@ class PlantConfig(Section, frozen=True, kw_only=True):
 
     @property
     def states_per_axis(self) -> int:
-        """Number of states of an axis, position and velocity first; 0 where the matrices say."""
+        """Number of states of an axis, position and velocity first; 0 where the matrices define it."""
         return {"matrices": 0, "drag-lag": 3, "velocity-reference": 6}[self.model]
 
 

@@ -1,7 +1,7 @@
 """Orders of the operator in flight: a Unix socket that the daemon reads after each tick without waiting.
 
-Each direction carries one JSON object a line: a `ControlRequest`, then its `Reply`. The reply to an order tells what
-the next tick decided. File permissions protect the socket (folder 0700, socket 0600). The kernel also tells the user
+Each direction carries one JSON object a line: a `ControlRequest`, then its `Reply`. The reply to an order holds what
+the next tick decided. File permissions protect the socket (folder 0700, socket 0600). The kernel also reports the user
 at the other end.
 """
 

@@ -101,12 +101,12 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
         DesignError: the mission does not fit the design.
     """
     if take_off_m is not None and "down" not in design.plant.axes:
-        raise UsageError("take-off: the plant has no vertical axis, so it cannot tell how high it is; see plant.axes")
+        raise UsageError("take-off: the plant has no vertical axis, so its height is unknown; see plant.axes")
     if take_off_m is None and goal is None:
         return
     region = build_mission(config, design, compute_reference_limits(design)).rest_region
     if region is None:
-        raise UsageError("take-off, goto: this plant cannot rest wherever it is sent; see plant")
+        raise UsageError("take-off, goto: this plant cannot rest at every target; see plant")
     refusal = "" if goal is None else region.describe_refusal(goal)
     if refusal:
         raise UsageError(f"goto: {refusal}")

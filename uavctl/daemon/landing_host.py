@@ -2,8 +2,8 @@
 
 1. Take what a landing needs from FEED, the number of a socket; see `uavctl.daemon.landing_guard`.
 2. Kill the flight's process if it gives no sign of life for `SILENCE_S`: a process that does no tick hears no pilot.
-3. Once it has died, read what the vehicle says, and ask it to land until it has accepted, or does not fly for us.
-4. Say that it has ended, how that ended, and how to read its recording.
+3. Once it has died, read the vehicle's messages, and ask it to land until it has accepted, or does not fly for us.
+4. Report the end of the flight, the answer to the landing request, and the recording.
 """
 
 from __future__ import annotations
@@ -120,10 +120,10 @@ def main(arguments: list[str]) -> int:
     if feed.landing.requests and feed.descriptor >= 0:
         _tell("error: the flight's process has ended in the air; landing is asked for")
         land(feed.landing, feed.descriptor, request)
-        _tell("ended: the vehicle lands, or is not ours any more" if request.is_answered else "ended: no answer")
+        _tell("ended: the vehicle lands, or another controller has it" if request.is_answered else "ended: no answer")
     else:
         _tell("error: the flight's process has ended; no landing is asked for")
-    _tell(f"recording: `uavctl log report {recording}` says how far it goes, and draws its page")
+    _tell(f"recording: `uavctl log report {recording}` shows how far the recording goes, and draws its page")
     return 0
 
 

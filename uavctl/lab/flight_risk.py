@@ -4,7 +4,7 @@
 of the configuration, with all that is random there:
 
 1. The vehicle moves as x(k+1) = A x(k) + B u(k) + E w(k), w ~ N(0, W), as the plans assume.
-2. A position is captured each Δt, with noise, and is lost or late as the link says. Where the flight uses inertial
+2. A position is captured each Δt, with noise, and is lost or late by the link's model. Where the flight uses inertial
    data, each step has one reading of them, with noise and a slow error, both as `estimator` assumes them.
 3. The flight's filter estimates state and biases. The flight's solver plans; a plan acts after the dead time.
 4. Where the position is as old as the horizon, the vehicle brakes by its predicted velocity.

@@ -163,7 +163,7 @@ NEAR_FIGURE = TableFigure("near_s", "to 0.3 m s", 1.0, 1)
 EXCESS_FIGURE = TableFigure("beyond_m", "beyond wall m", 1.0, 2)
 COUNT_FIGURES = (
     TableFigure("limited", "limited %", 100.0, 0),
-    TableFigure("gave_way", "gave way %", 100.0, 1),
+    TableFigure("gave_way", "relaxed %", 100.0, 1),
     TableFigure("fallback", "fallback %", 100.0, 1),
 )
 SCENARIO_FIGURES: dict[Scenario, tuple[TableFigure, ...]] = {
@@ -188,7 +188,7 @@ FIGURE_NOTE = (
     "is to be held. To 0.3 m, to 0.1 m: from when on it stayed so near, counted from the first order. Tracking: "
     "distance from where the motion was to be at the time, mean and largest. Beyond wall: furthest beyond a limit of "
     "the position; negative is the room that was left; with a blackout, from its begin on. Limited: share of setpoints "
-    "that the setpoint limiter changed. Gave way: share of plans in which a constraint gave way. Fallback: share of "
+    "that the setpoint limiter changed. Relaxed: share of plans with a relaxed constraint. Fallback: share of "
     "ticks in which no plan was flown."
 )
 

@@ -206,15 +206,15 @@ def describe_what_if(what_if: WhatIf) -> list[str]:
     if not reproduced.identical:
         state, input_ = reproduced.largest_state, reproduced.largest_input
         equality = f"not bit for bit: states within {state:.1e}, inputs within {input_:.1e}"
-    error_text = "" if model.rms_m is None else f", wrong by {model.rms_m:.3g} m (rms)"
-    prediction_text = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is told{error_text}"
+    error_text = "" if model.rms_m is None else f", error {model.rms_m:.3g} m (rms)"
+    prediction_text = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is explained{error_text}"
     changed = f"Changed: {', '.join(what_if.changed)}" if what_if.changed else "No key of the configuration was changed"
     inertial = []
     total = what_if.inertial_moved + what_if.inertial_left_out
     if what_if.inertial_left_out > _MIN_DROPPED_SHARE * total:
         inertial.append(
-            f"{what_if.inertial_left_out} of {total} inertial messages of the vehicle are left out of the other "
-            "course: late, frozen, or without an attitude that turns its acceleration."
+            f"{what_if.inertial_left_out} of {total} inertial messages of the vehicle are left out of the what-if "
+            "flight: late, frozen, or without an attitude that turns its acceleration."
         )
     return [
         f"Reproduced with nothing changed, {equality}.",
@@ -271,12 +271,12 @@ _SECTIONS: tuple[PageSection[_WhatIfView], ...] = (
         "Motion",
         lambda view: overlays.draw_positions(view.flights, view.other),
         note="Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits "
-        "and the band along them, the largest reserve that the plan of the moment kept, are those of the what-if.",
+        "and the band along them, the largest back-off of the plan at that time, are those of the what-if.",
         legend=(
             *_BOTH,
             Mark("dotted", "target", "target"),
             Mark("dashed", "limit", "limit"),
-            Mark("band", "limit", "reserve kept"),
+            Mark("band", "limit", "back-off"),
         ),
     ),
     PageSection(
@@ -288,8 +288,7 @@ _SECTIONS: tuple[PageSection[_WhatIfView], ...] = (
     PageSection(
         "Side by side",
         lambda view: [render_table(HEADINGS, make_comparison_rows(view.result), frozenset())],
-        note="The recorded flight flown again with nothing changed tells whether this version decides as the one that "
-        "flew. How far the model goes wrong within a second is what the what-if column cannot know: the same happens "
-        "to it, counted as disturbance.",
+        note="The column of the flight flown again unchanged shows whether this version decides as the recorded one. "
+        "The what-if counts the model's error as disturbance, so its figures are uncertain by that error.",
     ),
 )

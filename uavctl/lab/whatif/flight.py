@@ -183,13 +183,13 @@ def make_recorded_flight(entries: Iterable[Entry], config: Config, name: str) ->
     count = sum(map(len, samples.values()))
     if count < MIN_POSITIONS:
         raise RecordingError(
-            f"{name}: only {count} positions came in it; a what-if needs at least {MIN_POSITIONS}, of a flight under "
-            "setpoints (`uavctl log info` tells what there is)"
+            f"{name}: holds only {count} positions; a what-if needs at least {MIN_POSITIONS}, of a flight under "
+            "setpoints (`uavctl log info` shows the contents)"
         )
     flight = FlightData.from_records(kept_entries)
     if not any(at_ns in setpoints and takes_setpoint for at_ns, takes_setpoint in takes_setpoints.items()):
         raise RecordingError(
-            f"{name}: the vehicle never took a setpoint in it, so there is nothing that could have gone otherwise"
+            f"{name}: the vehicle never took a setpoint in this recording, so a what-if has nothing to change"
         )
     return RecordedFlight(kept_entries, flight, config, setpoints, takes_setpoints, dict(samples))
 
@@ -491,7 +491,7 @@ def find_captures(history: RecordedFlight, noise: Callable[[], Array]) -> list[C
     received = _collect_received(history)
     if len(received) < MIN_POSITIONS:
         raise RecordingError(
-            f"only {len(received)} positions of the recording carry a stamp, so nobody knows which were lost; "
+            f"only {len(received)} positions of the recording carry a stamp, so the lost ones are unknown; "
             "fly them over the recorded link"
         )
     path = _VehiclePath(history, received)
