@@ -1,4 +1,4 @@
-"""The flight's end of its live view: a process that shows what is sent to it, and never holds the flight up.
+"""The flight's end of its live view: a process that shows the records sent to it, and never delays the flight.
 
 Messages go through a pair of sockets that keeps message bounds. While the process does not read, they are dropped.
 """

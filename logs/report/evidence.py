@@ -167,7 +167,7 @@ class FlightEvidence:
         return self.flight.estimates[index].age_s + at_s - float(self.estimate_s[index])
 
     def compute_stalled_s(self, at_s: Array) -> Array:
-        """Return for how long until each time (n,) we did not run [s]: what came then was heard later, all at once."""
+        """Return for how long until each time (n,) we did not run [s]; messages of pauses are read later."""
         ticks_s = self.flight.seconds([decision.at_ns for decision in self.flight.decisions])
         pauses_s = np.diff(ticks_s)
         stalled_s = np.append(0.0, np.cumsum(np.where(pauses_s > MIN_STALL_S, pauses_s, 0.0)))

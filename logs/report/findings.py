@@ -79,7 +79,7 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def make_headline(findings: Iterable[Finding], outcome: str = "", reasons: Iterable[str] = ()) -> Headline:
-    """Make the headline of findings, at least one: the gravest, what brought it about, and what came of it.
+    """Make the headline of findings, at least one: the gravest, its causes, and its effects.
 
     Args:
         outcome: A clause on how the flight ended and where it stayed.

@@ -221,14 +221,14 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
         ),
     ),
     PageSection(
-        "The link, estimated against promised",
+        "The link, measured against promised",
         _show_link,
         note=_explain_link,
         legend=(Mark("line", "estimate", "measured"), Mark("dashed", "limit", "promised"), _HORIZON),
         is_closed=True,
     ),
     PageSection(
-        "Plans against what was flown",
+        "Plans against the flight",
         _draw_plans,
         note="A few plans on the way to the target, each with its back-off from the limits at each stage.",
         legend=(

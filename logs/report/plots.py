@@ -312,7 +312,7 @@ def _find_plan_end_s(flight: FlightData) -> float:
 
 
 def draw_plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
-    """Draw a few plans over what was then flown, axis by axis."""
+    """Draw a few plans over the flight, axis by axis."""
     plans = choose_plans(flight)
     if not plans:
         return
@@ -338,7 +338,7 @@ def draw_plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
 
 
 def _draw_plans_above(flight: FlightData, plans: list[Plan], end_s: float) -> Drawing:
-    """Draw a few plans over what was then flown, from above."""
+    """Draw a few plans over the flight, from above."""
     design, (t_s, position) = flight.design, get_positions(flight)
     flown = thin_path(position[t_s <= end_s])
     with open_canvas("plan-above", 2.5) as canvas:

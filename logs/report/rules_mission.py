@@ -109,7 +109,7 @@ def find_refused_start(e: FlightEvidence) -> Iterator[Finding]:
 
 
 def _find_release_s(e: FlightEvidence) -> float | None:
-    """Return when it was let go, or when the fallback had it land or stopped [s]; None if neither was."""
+    """Return when the vehicle was released, or when the fallback let it land or stopped [s]; None if neither was."""
     ends = (d.at_ns for d in e.flight.flown if d.mode in (ControlMode.LAND, ControlMode.STOPPED))
     at_ns = e.flight.breach.at_ns if e.flight.breach is not None else next(ends, None)
     return None if at_ns is None else e.to_seconds(at_ns)

@@ -51,7 +51,7 @@ def render_tlog_page(flight: MavlinkFlight) -> str:
 
 
 def describe_recording(info: MavlinkFlightInfo) -> Iterator[str]:
-    """Return what the table does not have, in sentences: what is odd about the recording."""
+    """Return sentences on oddities of the recording that the table does not have."""
     if info.vehicle_system is None:
         yield "The recording holds no heartbeat of an autopilot, so it does not show the vehicle's flight."
     yield from (f"{note}." for note in info.notes)

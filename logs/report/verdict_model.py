@@ -251,11 +251,11 @@ def _describe_outcome(
     prefix = f"Over {count} positions"
     departures = "; ".join(_describe_departures(axes))
     if outcome is ModelOutcome.REFUTED:
-        text = f"{prefix} the vehicle contradicts the model" + (
-            f": {departures}." if departures else " some time ahead."
+        text = f"{prefix} this flight refutes the model" + (
+            f": {departures}." if departures else " at longer times ahead."
         )
     elif outcome is ModelOutcome.CAUTIOUS:
-        text = f"{prefix} the model is cautious" + (f": {departures}." if departures else " some time ahead.")
+        text = f"{prefix} the model is cautious" + (f": {departures}." if departures else " at longer times ahead.")
     else:
         text = (
             f"{prefix} the errors of the forecast are as large as predicted, centred and white: the model is "

@@ -130,7 +130,7 @@ def _describe_risk(limits: list[LimitRisk], refuted_limits: list[LimitRisk], sou
         first = refuted_limits[0]
         promised_percent = 100 * (first.promised or 0.0)
         return (
-            f"The promise was exceeded: {first.name} outside at {first.measured.hits} of {first.measured.trials} steps "
+            f"The promise is refuted: {first.name} outside at {first.measured.hits} of {first.measured.trials} steps "
             f"with a new position; the design promised at most {promised_percent:.3g} % (p = {first.p_value:.2g}). "
             "Model, link or noise are worse than the design assumes."
         )

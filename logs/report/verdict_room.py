@@ -1,4 +1,4 @@
-"""Verdict on the room: what is promised of such flights, and whether this one left it."""
+"""Verdict on the room: the promised risk to leave it, and whether this flight did."""
 
 from __future__ import annotations
 

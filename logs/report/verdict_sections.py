@@ -80,7 +80,7 @@ def _make_risk_row(risk: LimitRisk) -> tuple[str, ...]:
         _format_percent(risk.measured.high),
         "unknown"
         if risk.promised is None
-        else f"{_format_percent(risk.promised)}{', exceeded' if risk.refuted else ''}",
+        else f"{_format_percent(risk.promised)}{', refuted' if risk.refuted else ''}",
     )
 
 
@@ -173,7 +173,7 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
         is_closed=True,
     ),
     PageSection(
-        "Verdict: the model against what was flown",
+        "Verdict: the model against the flight",
         _show_model,
         note="The flight's filter runs again over all positions that it used, in the order of capture. An error is a "
         "position minus its prediction from earlier positions. If the model is right, errors are as large as predicted "

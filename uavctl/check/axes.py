@@ -133,7 +133,7 @@ def _check_axis_match(
         if is_used
     )
     if remaining:
-        value = f"nothing contradicts ({methods}), not excluded: " + "; ".join(mistake.name for mistake in remaining)
+        value = f"consistent ({methods}), not excluded: " + "; ".join(mistake.name for mistake in remaining)
         return make_item("axes", ItemState.UNDETERMINED, value, _WANT, _MOVE)
     return make_item("axes", ItemState.GOOD, f"the same ({methods})", _WANT)
 
@@ -201,7 +201,7 @@ def _check_heading(data: CheckData, config: Config) -> tuple[Item, bool]:
     if abs(yaw) > limit_deg:
         hint = (
             f"turn the frame (frame.yaw_deg {yaw:.0f} deg too large, or frame.convention), turn the body's own axes in "
-            "the cameras' software with its nose along their first axis, or see to the vehicle's compass"
+            "the cameras' software with its nose along their first axis, or check the vehicle's compass"
         )
         return make_item(name, ItemState.BAD, value, want, hint), False
     return make_item(name, ItemState.GOOD, value, want), True

@@ -205,7 +205,7 @@ def _check_noise(samples: list[Sample], config: Config) -> Item:
     low, high = np.percentile(np.array([sample.position_m for sample in samples]), [5, 95], axis=0)
     if float((high - low).max()) > max(10.0 * noise_m, config.check.move_m):
         return make_item("position noise", ItemState.UNDETERMINED, f"{value}, but the body moved", want, "let it rest")
-    hint = "see to the cameras' calibration, or raise estimator.position_std_m"
+    hint = "check the cameras' calibration, or raise estimator.position_std_m"
     for scale, unit in () if uses_camera_system(config) else _UNITS:
         if (
             configured_m * _NOISE_FACTOR < noise_m <= configured_m * scale * _NOISE_FACTOR

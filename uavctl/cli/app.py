@@ -60,11 +60,11 @@ _COMMANDS = {
     "identify": ("identify:identify_command", "Identify plant, lag, disturbance and link from a recording."),
     "tune": ("tune:tune", "Excite inside a box, identify, write a tuned configuration, fly again, compare."),
     "bench": ("bench:bench", "Measure the speed of a decision, beside the problem as printed."),
-    "paper": ("paper:paper", "Reproduce Section 5 of the paper, every claim beside what was measured."),
+    "paper": ("paper:paper", "Reproduce Section 5 of the paper, every claim beside its measured figure."),
     "campaign": ("campaign:campaign", "Fly many runs of many controllers on the same noise and the same losses."),
-    "ctl": ("ctl:ctl_app", "Give a flight that goes on an order: goto, hold, resume, land, engage; or its status."),
+    "ctl": ("ctl:ctl_app", "Send an order to a running flight: goto, hold, resume, land, engage; or show its status."),
     "key": ("key:key_app", "Make and look at keys of MAVLink 2 signing."),
-    "log": ("log:log_app", "Look into recordings: info, recover, replay, report, compare, whatif, export."),
+    "log": ("log:log_app", "Read recordings: info, recover, replay, report, compare, whatif, export."),
     "docs": ("app:docs", "Show a page of the manual, or list its pages."),
 }
 _USAGES = {"docs": {"usage": "Usage: uavctl docs [PAGE]"}}

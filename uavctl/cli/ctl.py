@@ -27,7 +27,7 @@ _MAX_ANSWER_BYTES = 2**20  # a daemon's status has some thousand
 
 ctl_app = App(
     name="ctl",
-    help="Orders to a flight that goes on: goto, hold, resume, land, engage; and its status.",
+    help="Orders to a running flight: goto, hold, resume, land, engage; and its status.",
     help_epilogue=format_example("ctl"),
     help_format="markdown",
 )
@@ -127,16 +127,16 @@ def send_request(request: ControlRequest, folder: Path, vehicle: str | None) -> 
             line = bytearray()
             while not line.endswith(b"\n"):
                 if len(line) > _MAX_ANSWER_BYTES:
-                    raise NotReachedError("the answer does not end; is another program at this socket?")
+                    raise NotReachedError("the answer does not end; does another program use this socket?")
                 data = connection.recv(_BLOCK_BYTES)
                 if not data:
-                    raise NotReachedError("the daemon hung up: it is ending, or runs as another user")
+                    raise NotReachedError("the daemon closed the connection: it is ending, or runs as another user")
                 line += data
             return msgspec.json.decode(line, type=Reply)
         except OSError as error:
             raise NotReachedError(
                 f"no answer within {ANSWER_LIMIT_S:g} s ({error}); the daemon is not ready yet (its design, the check "
-                "before arming), or the control loop may hang: see to the vehicle"
+                "before arming), or the control loop may hang: watch the vehicle"
             ) from error
         except msgspec.MsgspecError as error:
             raise NotReachedError(f"the answer is not understood ({error}); is the daemon of this version?") from error

@@ -244,7 +244,7 @@ def print_losses(status: RecorderStatus) -> None:
         print_message(
             label_text(
                 "warning",
-                f"{loss} ({status.reason or status.refusal or 'the disk was too slow'}); what is in it is whole. "
+                f"{loss} ({status.reason or status.refusal or 'the disk was too slow'}); the records in it are whole. "
                 f"Files: {', '.join(name for name in status.segments if name not in missing_files) or 'none'}"
                 + (f". Deleted or moved: {', '.join(missing_files)}" if missing_files else ""),
                 "bold red",

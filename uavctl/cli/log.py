@@ -209,7 +209,7 @@ _COMMANDS = {
     ),
     "compare": (
         "log_report:compare_command",
-        "Put flights beside each other: parameters that differ, figures, and where they part.",
+        "Compare flights: parameters that differ, figures, and the first difference.",
     ),
     "whatif": (
         "whatif:whatif",

@@ -55,7 +55,7 @@ def compare_command(
     out: Annotated[Path | None, Parameter(help="also write a page (HTML) with the flights in one drawing")] = None,
     json: Json = False,
 ) -> int:
-    """Put flights beside each other: parameters that differ, figures, and where they part."""
+    """Compare flights: parameters that differ, figures, and the first difference."""
     with make_progress() as progress:
         paths = (first, second, *more)
         task = progress.add_task("reading", total=len(paths))

@@ -72,7 +72,7 @@ def paper(
     ] = False,
     json: QuietJson = False,
 ) -> int:
-    """Fly Section 5 of the paper, draw its figures, and hold every claim against what was measured."""
+    """Fly Section 5 of the paper, draw its figures, and compare every claim with its measured figure."""
     begin_s = time.perf_counter()
     _make_folder(out)
     chosen_tau = PRINTED.tau if tau is None and runs > MAX_RUNS_OF_BOTH else tau

@@ -161,7 +161,7 @@ def measure_position(config: Config) -> Vec3:
     if not samples:
         raise NotReachedError(
             f"no position came within {LISTEN_S:g} s, so nobody knows whether the vehicle stands in the box; "
-            "see to the cameras (`uavctl check`)"
+            "check the cameras (`uavctl check`)"
         )
     ((source, _),) = Counter(sample.source for sample in samples).most_common(1)
     north, east, down = np.median([sample.position_m for sample in samples if sample.source == source], axis=0).tolist()

@@ -45,8 +45,8 @@ def change_config(
         key = text.partition("=")[0].strip()
         if key.split(".")[0] in RECORDED_KEYS or (key.startswith("source.") and key != _RATE):
             raise UsageError(
-                f"--set {text}: {key} is part of what was recorded and cannot be another one now; what can be changed "
-                "is the controller, its beliefs (plant, sets, cost, smpc, schedule, ...) and link.*"
+                f"--set {text}: {key} is part of the recording and cannot be changed; a what-if may "
+                "change the controller, its model (plant, sets, cost, smpc, schedule, ...) and link.*"
             )
     name = f"{flight} (configuration)"
     loaded = parse_recorded(toml, name, overrides) if config is None else load(config, overrides)

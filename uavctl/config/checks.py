@@ -427,7 +427,7 @@ def _check_link(link: LinkConfig) -> Iterator[ConfigProblem]:
         yield ConfigProblem(
             "link.probability",
             "ends in 0, which is repeated: nothing arrives for ever",
-            "add the probability that goes on; use link.blackout to test an outage",
+            "add the probability that repeats; use link.blackout to test an outage",
         )
     for name in ("blackout", "held", "uplink_blackout"):
         yield from check_spans(f"link.{name}", getattr(link, name))

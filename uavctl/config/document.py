@@ -23,7 +23,7 @@ from msgspec.structs import FieldInfo
 
 
 class ConfigProblem(NamedTuple):
-    """Key path, what is wrong with it, and what to do."""
+    """Key path, its error, and the remedy."""
 
     key: str
     reason: str
@@ -356,7 +356,7 @@ class Source:
         return f"{self.file}:1"
 
     def describe(self, problem: ConfigProblem) -> str:
-        """One line: place, key, what is wrong, what to do."""
+        """One line: place, key, error, remedy."""
         return f"{self.locate(problem.key)}: {problem.key}: {problem.reason}; {problem.todo}"
 
 

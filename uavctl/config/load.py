@@ -148,7 +148,7 @@ _UNKNOWN = "unknown key"
 # Keys of before that have no meaning any more, and why; values of before, with why and what to write instead.
 _REMOVED = {
     "solver.exact": "it had a meaning with the policy library only, which is gone",
-    "log.stop_bytes": "a recording goes on until the disk is full",
+    "log.stop_bytes": "a recording continues until the disk is full",
 }
 _REMOVED_VALUES = {("solver.method", "library"): ("the policy library is gone", 'remove the key, or write "exact"')}
 _MAX_NAMED = 3  # keys that a wrong one may have meant

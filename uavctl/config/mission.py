@@ -167,7 +167,7 @@ def parse_heading(cell: str) -> tuple[str, float, str] | None:
 
 
 def read_header(cells: Sequence[str]) -> tuple[dict[str, StatedColumn], list[str]]:
-    """The columns of a header by quantity, and what is wrong with it."""
+    """The columns of a header by quantity, and its errors."""
     columns: dict[str, StatedColumn] = {}
     problems: list[str] = []
     for index, cell in enumerate(cells):

@@ -326,7 +326,7 @@ Bound = Annotated[float, Meta(gt=0, le=1e6)] | None
 
 
 class EnvelopeConfig(Section, frozen=True, kw_only=True):
-    """Bounds in flight; beyond them the vehicle is let go: level, then its own landing (docs/faults.md)."""
+    """Bounds in flight; beyond them the vehicle is released: level, then its own landing (docs/faults.md)."""
 
     outside_m: Annotated[
         Bound,

@@ -99,7 +99,7 @@ def fly(
 
 
 class _Flight:
-    """Flight of one vehicle: its cycles, and what is done where they fail."""
+    """Flight of one vehicle: its cycles, and the actions on failure."""
 
     stop_requested: Callable[[], bool]
     duration_s: float | None
@@ -376,7 +376,7 @@ class _RefusalReporter:
         self._next_ns = 0
 
     def report(self, at_ns: int, *, is_last: bool = False) -> None:
-        """Report new counts if a second has passed, a peer has hung up, or this is the last call."""
+        """Report new counts if a second has passed, a peer has closed the connection, or this is the last call."""
         hung_up = any(
             connection.refused[EventCode.HUNG_UP] > self._reported[name][EventCode.HUNG_UP]
             for name, connection in self._connections.items()

@@ -173,7 +173,7 @@ def _lock_file(path: Path, url: str) -> int:
             ) from error
         except OSError as error:
             raise VehicleTakenError(
-                f"{path}: {error.strerror}, so nothing shows that {url} is free; see to the file or its folder"
+                f"{path}: {error.strerror}, so nothing shows that {url} is free; check the file and its folder"
             ) from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

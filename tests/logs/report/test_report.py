@@ -24,8 +24,8 @@ from uavctl.records import Checked, ControlMode, Decision, Estimate, Plan, Recor
 
 SECTIONS = [
     *("Timeline", "Path", "Each axis against its limits", "Inputs", "Age of information"),
-    *("The link, estimated against promised", "Plans against what was flown", "Certificates and slack", "Time taken"),
-    *("Verdict: promised risk against measured", "Verdict: the model against what was flown", "Verdict: clocks"),
+    *("The link, measured against promised", "Plans against the flight", "Certificates and slack", "Time taken"),
+    *("Verdict: promised risk against measured", "Verdict: the model against the flight", "Verdict: clocks"),
     *("Configuration and parameters", "Made with", "Events", "Summary"),
 ]
 ROOM_PLOTS = (
