@@ -1,4 +1,4 @@
-"""Foxglove's protocol: what a viewer is offered, what it asks for, and what waits for it. Nothing can be written.
+"""Foxglove's protocol: offered channels, subscriptions, and waiting messages. Nothing can be written.
 
 https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 """
@@ -61,7 +61,7 @@ def make_advertisement(channels: list[tuple[int, Definition]]) -> bytes:
 
 
 class Subscriber:
-    """A viewer: what it has asked for, and the newest messages that wait for it.
+    """A viewer: its subscriptions, and the newest messages that wait for it.
 
     Attributes:
         offered: Number of channels that it knows.

@@ -25,7 +25,7 @@ from uavctl.errors import RecordingError
 
 _MAX_READS = 64  # messages that are taken before clients are served again
 _NICENESS = 19  # the flight and all that it needs come first
-_DESCRIPTOR_LIMIT = 128  # several times what the server's own limits allow
+_DESCRIPTOR_LIMIT = 128  # several times the server's own limits
 _OOM_SCORE = Path("/proc/self/oom_score_adj")
 
 

@@ -101,7 +101,7 @@ class LiveProcess:
         self._helper.close()
 
     def _start(self) -> HelperProcess:
-        """Start a process, and give it what is known.
+        """Start a process, and give it the known records.
 
         Raises:
             OSError: The system does not allow that now.
@@ -131,7 +131,7 @@ class LiveProcess:
             self._on_death(f"{reason}; {outcome}")
 
     def _restart(self) -> tuple[bool, str]:
-        """Start a process again, if that is still allowed; return whether one serves, and what happened in words."""
+        """Start a process again, if that is still allowed; return whether one serves, and the event in words."""
         self._helper.socket.close()
         outcome = "it is not started again"
         if self._restarts < MAX_RESTARTS:

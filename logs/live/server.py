@@ -34,7 +34,7 @@ class LiveServer:
     """Serves one flight.
 
     Args:
-        get_scene: Returns what pages show now, as JSON.
+        get_scene: Returns the newest scene, as JSON.
         token: Path by which pages of other sites may open the WebSocket.
     """
 
@@ -165,7 +165,7 @@ class LiveServer:
 
 
 async def _take_requests(subscriber: Subscriber, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Answer what a viewer asks until it takes its leave."""
+    """Answer a viewer's requests until it disconnects."""
     while True:
         opcode, data = await read_frame(reader, PATIENCE_S)
         if opcode is Opcode.CLOSE:

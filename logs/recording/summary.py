@@ -44,7 +44,7 @@ def _find_cause(flight: FlightData) -> Cause:
     modes = [decision.mode for decision in flight.flown]
     if flight.breach is not None:
         return Cause.ENVELOPE
-    if ControlMode.LAND in modes:  # for one tick; nobody flies after it
+    if ControlMode.LAND in modes:  # for one tick; no control after it
         if flight.landing is None:
             return Cause.FALLBACK_LANDED
         return Cause.LANDED_AS_ORDERED if flight.landing.ordered else Cause.LANDED_AFTER_MISSION
@@ -72,7 +72,7 @@ def _describe_cause(flight: FlightData, cause: Cause) -> str:
 
 
 def _describe_hand_over(flight: FlightData) -> str:
-    """Return in words what the controller did after the operator's stop."""
+    """Return in words the controller's actions after the operator's stop."""
     modes = {d.mode for d in flight.decisions[len(flight.flown) :]}
     if ControlMode.LAND in modes:
         return "the vehicle was handed over to its own landing"
@@ -151,7 +151,7 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     received: int  # positions: sent - lost when simulated, else samples accepted; in a part of a flight, those of it
     lost: int | None  # positions that the simulated channel lost; None for a real flight
     max_age: int  # largest age of information at a flown boundary [steps]
-    fallbacks: int  # entries into braking, holding or landing that nobody wanted
+    fallbacks: int  # entries into braking, holding or landing without an order
     state_violations: int  # flown boundaries with the state outside its set
     input_violations: int  # flown boundaries with the input outside its set
     slack_used: int  # flown plans with a relaxed constraint or a missed terminal equality

@@ -15,7 +15,7 @@ _CELL_V, _FULL_V = 3.3, 4.35  # of a lithium cell: under load below this it is l
 
 
 def find_battery_faults(at_s: Array, volts: Array) -> Iterator[Finding]:
-    """Find a battery that fell to nothing, or below what its cells may have under load.
+    """Find a battery that is empty, or below the least voltage of its cells under load.
 
     Args:
         at_s: Times in the air (n,) [s].

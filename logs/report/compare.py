@@ -182,7 +182,7 @@ def _compute_rms(values: NDArray[np.float64]) -> float | None:
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
 
 
-# How a recording was made, and what a computer's clock said: not what was flown.
+# Origin of a recording and times of the computer's clock: not properties of the flight.
 _IGNORED_TOPICS = frozenset({HEADER, LIBRARY, RECORDER, "/uavctl/timing"})
 _MAX_VALUE_CHARACTERS = 72  # characters of a value
 
@@ -193,7 +193,7 @@ class FirstDivergence(msgspec.Struct, frozen=True, kw_only=True):
     topic: str
     flight_s: float  # since the first tick of the first recording
     field: str  # path in the record; empty if there is none on one side, or at another time
-    first: str  # what the first recording has there
+    first: str  # value in the first recording
     other: str
 
 
@@ -221,7 +221,7 @@ class FlightComparison(msgspec.Struct, frozen=True, kw_only=True):
     likenesses: tuple[Match, ...]
     parameters: tuple[ParameterDifference, ...]
     figures: tuple[Figure, ...]
-    notes: tuple[str, ...]  # what to mind when reading the figures
+    notes: tuple[str, ...]  # cautions for reading the figures
 
 
 def compare_flights(recordings: Sequence[LoadedFlight]) -> FlightComparison:
@@ -307,7 +307,7 @@ def _shorten(text: str) -> str:
 
 
 def _collect_parameters(recording: LoadedFlight) -> dict[str, object]:
-    """Return what a flight was set up with: configuration, design, library, versions, processor."""
+    """Return the set-up of a flight: configuration, design, library, versions, processor."""
     header: Header = recording.flight.header
     try:
         config = parse_stored_toml(header.config_toml, "configuration")

@@ -1,4 +1,4 @@
-"""Account of a recorded flight: what its records, figures and verdicts show. Headline and page are made from it."""
+"""Account of a recorded flight: its records, figures and verdicts. Headline and page are made from it."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from logs.recording.summary import BLIND_S, RELATIVE_TOLERANCE, compute_box
 from uavctl.arrays import Array, Flags
 from uavctl.records import Estimate
 
-GRAVE_M = 0.05  # beyond a limit: further than what a plan promises to keep now and then
+GRAVE_M = 0.05  # beyond a limit: further than the promised probability explains
 _WALL_NAMES = {
     ("north", 1): "north wall",
     ("north", 0): "south wall",
@@ -76,7 +76,7 @@ class Clearance:
                 if not np.isfinite(wall := constant[state]):
                     continue
                 name, never = _WALL_NAMES[axis, side], np.inf if side else -np.inf
-                # The floor is where a vehicle starts and lands, and a fence is what plans keep within.
+                # A vehicle starts and lands on the floor; plans keep within a fence.
                 measure(name, axis, side, np.where(flown, wall, never if name == "floor" else wall))
                 if np.any(limit != wall):
                     measure(f"{name.removesuffix(' wall')} fence", axis, side, np.where(flown, limit, never))
@@ -156,7 +156,7 @@ def _collect_airborne_positions(flight: FlightData) -> tuple[Array, Array, Flags
 
 
 def _find_airborne_s(flight: FlightData) -> float:
-    """Return when the vehicle was flown, or said to be armed and not on the ground, for the first time [s]."""
+    """Return when the vehicle was flown, or reported armed and not on the ground, for the first time [s]."""
     airborne_ns = [status.at_ns for status in flight.vehicles if status.armed and status.landed is False]
     engaged_s = [begun_s for begun_s, _ in flight.spans(FLOWN)[:1]]
     return min([*engaged_s, *flight.seconds(airborne_ns[:1]).tolist()], default=np.inf)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from uavctl.cause import CAUSES, Cause, CauseRank
 
 _RANKS = tuple(CauseRank)
-# Of what went wrong with the vehicle, what may have brought it about; the likeliest comes first.
+# Possible causes of trouble with the vehicle; the likeliest comes first.
 _ROOTS = (
     Cause.BATTERY_EMPTY,
     Cause.BATTERY_LOW,
@@ -47,7 +47,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Banner:
-    """First line of a page: what matters most, in colour and words, and the sentences below it."""
+    """First line of a page: the main result in colour and words, and the sentences below it."""
 
     tone: str  # GOOD, CAUTION or BAD
     word: str  # result in a few words, so that it is readable without colour
@@ -120,7 +120,7 @@ def _is_in_outcome(finding: Finding, outcome: str) -> bool:
     return bool(outcome) and finding.cause is Cause.NOT_AS_ORDERED
 
 
-_MAX_CAUSE_DELAY_S = 1.0  # a heartbeat: causes are known that much later than what they bring about
+_MAX_CAUSE_DELAY_S = 1.0  # a heartbeat: causes are known that much later than their effects
 
 
 def metres(value: float) -> str:

@@ -52,7 +52,7 @@ _START_S = 1.0  # it is still about where it began
 
 
 def derive_headline(evidence: FlightEvidence) -> Headline:
-    """Return what matters most in a flight."""
+    """Return the headline of a flight."""
     findings = sort_findings(finding for rule in RULES for finding in rule(evidence))
     if not findings:
         return make_headline([_make_clear_finding(evidence)], reasons=describe_reasons(evidence, None))
@@ -64,7 +64,7 @@ def derive_headline(evidence: FlightEvidence) -> Headline:
 
 
 def derive_headline_of_file(path: Path) -> Headline | None:
-    """Return what matters most in a recording of ours; None where it holds no flight that can be judged."""
+    """Return the headline of a recording of ours; None where it holds no flight that can be judged."""
     try:
         flight = FlightData.from_records(read(path), path)
     except RecordingError:
@@ -104,7 +104,7 @@ def _describe_outcome(e: FlightEvidence, main_finding: Finding) -> str:
 
 
 def _make_clear_finding(e: FlightEvidence) -> Finding:
-    """Return that nothing was found, with what could not be judged."""
+    """Return that nothing was found, with the unknowns."""
     s = e.summary
     target_name = "trajectory" if s.trajectory else "target"
     texts = [_describe_clearance(e)]

@@ -43,7 +43,7 @@ class InnovationSamples:
     """Positions against their forecasts, by the flight's own filter."""
 
     t_s: Array  # capture times of the report (n,) [s]
-    error_m: Array  # position minus what the ones before it predict (n, axes) [m]
+    error_m: Array  # position minus its prediction from earlier ones (n, axes) [m]
     std_m: Array  # deviation predicted (n, axes) [m]
     lead_steps: NDArray[np.int64]  # steps ahead of a forecast, 1 … H (m,), of windows that follow each other
     distance: Array  # squared distance of the position from its forecast, by the forecast's covariance (m,)

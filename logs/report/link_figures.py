@@ -25,7 +25,7 @@ def draw_link_ages(flight: FlightData, verdict: LinkVerdict) -> Iterator[Drawing
 
 
 def draw_link_in_flight(flight: FlightData, verdict: LinkVerdict) -> Iterator[Drawing]:
-    """Draw the estimated share of arrivals over time, and a histogram of the delay; what never changed is left out."""
+    """Draw the estimated share of arrivals over time, and a histogram of the delay; constant ones are left out."""
     if has_variation(np.array([estimate.arrival_mean for estimate in flight.link_estimates])):
         yield _draw_arrivals(flight)
     if verdict.delay is not None and has_variation(compute_delays_s(flight)):

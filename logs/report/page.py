@@ -31,7 +31,7 @@ MarkKind = Literal[
 
 
 def is_always_shown(_: object) -> bool:
-    """Return True: the condition of what every page has."""
+    """Return True: the condition of a section on every page."""
     return True
 
 

@@ -26,7 +26,7 @@ from logs.report.svg import Drawing, colour, open_canvas
 from uavctl.arrays import Array
 from uavctl.records import Plan
 
-OPEN_SIDE_M = 1.0  # an open side of the room is drawn so far beyond what was flown
+OPEN_SIDE_M = 1.0  # an open side of the room is drawn so far beyond the flight
 _STAGES = (3, 6, 12)  # of a plan whose spread is shown
 _MAX_GRID_LINES = 20.0  # of the floor's grid, at most, in each direction
 _DROP_LINES = 12  # lines from the path to the floor

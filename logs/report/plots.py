@@ -27,7 +27,7 @@ DOTTED = (0, (1, 1.6))
 # Axes as people see them: down is drawn as height, upwards.
 DISPLAY_AXES = {"north": ("north", 1.0), "east": ("east", 1.0), "down": ("height", -1.0)}
 
-# Views of the path that the page's cursor moves in: its name, the axes across and up, and what a place becomes there.
+# Views of the path that the page's cursor moves in: its name, the axes across and up, and the projection.
 # In three dimensions north runs into the picture, to the upper right.
 VIEWS: dict[str, tuple[tuple[str, ...], Array]] = {
     "above": (("east", "north"), np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])),
@@ -420,7 +420,7 @@ def set_time_axis(ax: Axes, flight: FlightData) -> None:
 
 
 def thin_samples(t_s: Array, values: Array) -> tuple[Array, Array]:
-    """Thin points to about `POINTS`, keeping each bucket's smallest and largest value; drop what is not finite."""
+    """Thin points to about `POINTS`, keeping each bucket's smallest and largest value; drop non-finite ones."""
     is_finite = np.isfinite(values)
     t_s, values = t_s[is_finite], values[is_finite]
     if len(values) <= MAX_POINTS:

@@ -23,7 +23,7 @@ HEARTBEAT_TIMEOUT_S = 2.5  # a heartbeat comes each second
 WRONG_POSITION_M = 0.3  # between a position that was used and the true place: no noise of a camera
 NEGLIGIBLE_SHARE = 0.05  # of positions, plans, or steps
 NEGLIGIBLE_COUNT = 3  # positions; some sources send each value twice
-_SLIGHT_M = 0.02  # beyond a wall: no more than what a camera and the estimator are off by
+_SLIGHT_M = 0.02  # beyond a wall: within the error of camera and estimator
 
 
 def describe_depth(e: FlightEvidence, excursion: Excursion) -> str:
@@ -71,7 +71,7 @@ def _describe_circumstances(e: FlightEvidence, excursion: Excursion) -> str:
 
 
 def find_vehicle_loss(e: FlightEvidence) -> Iterator[Finding]:
-    """Find a vehicle that was not heard, has started anew, or disarmed in flight; and a controller that failed."""
+    """Find a vehicle that was silent, restarted, or disarmed in flight; and a controller that failed."""
     flight, cause = e.flight, e.summary.ending.code
     heartbeat_s = flight.seconds([*(status.at_ns for status in flight.vehicles), flight.decisions[-1].at_ns])
     # A vehicle that is disarmed may be switched off.

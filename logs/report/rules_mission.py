@@ -103,7 +103,7 @@ def find_refused_start(e: FlightEvidence) -> Iterator[Finding]:
     text_list = ", ".join(list(dict.fromkeys(quoted_texts))[:_MAX_TEXTS])
     text = (
         f"it refused {count(len(refused_s), 'time')} to "
-        f"{_START_ORDERS[order]}{f' and said {text_list}' if text_list else ''}"
+        f"{_START_ORDERS[order]}{f' and reported {text_list}' if text_list else ''}"
     )
     yield Finding(Cause.BEGIN_REFUSED, refused_s[0], text)
 
@@ -172,7 +172,7 @@ def find_fallback(e: FlightEvidence) -> Iterator[Finding]:
 def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
     """Find places that were not reached, and a vehicle that was off its target once it had been there.
 
-    A mission asks to be within `mission.accept_m` of each place. So that is what a flight may be off at most, and half
+    A mission asks to be within `mission.accept_m` of each place. So a flight may be off by that at most, and by half
     of it in the root mean square.
     """
     s, flight = e.summary, e.flight

@@ -17,7 +17,7 @@ from uavctl.mavlink.clocksync import StampRefusal
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.mavlink.relay import HELD_BACK, REASONS
 
-_MAX_DRIFT_STEP_M = 0.1  # what a drifting source adds from one position to the next; a jump adds more
+_MAX_DRIFT_STEP_M = 0.1  # largest step of a drifting source between positions; a jump is larger
 _UNUSABLE_SHARE = 0.2  # of positions: more than come out of order, or twice, on any link
 _RELAY_TIMEOUT_S = 2.0  # without a position passed on: vehicles' estimators give up after 5 to 7 s
 _SAMPLE_CAUSES = (

@@ -1,4 +1,4 @@
-"""Sentences on what happened in a flight, made from its figures."""
+"""Sentences on the course of a flight, made from its figures."""
 
 from __future__ import annotations
 

@@ -114,9 +114,7 @@ class Canvas:
 
     figure: Figure
     svg: str = field(default="", init=False)
-    cursor_axes: str = field(
-        default="", init=False
-    )  # what its first axes show, for the page's cursor: "time", or a view
+    cursor_axes: str = field(default="", init=False)  # kind of its first axes, for the page's cursor: "time", or a view
 
     def axes(self, title: str, x_label: str, y_label: str, left_in: float = _LEFT_IN) -> Axes:
         """Add one set of axes, titled and labelled, that fills the figure.
@@ -198,7 +196,7 @@ def make_standalone(svg: str, label: str) -> str:
 
 
 def _convert_to_inline(text: str, key: str) -> str:
-    """Return an SVG for HTML: without what HTML does not need, ids apart, numbers short, colours from the page."""
+    """Return an SVG for HTML: without parts that HTML ignores, ids apart, numbers short, colours from the page."""
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text).replace("xlink:href=", "href=")

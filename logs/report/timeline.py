@@ -86,7 +86,7 @@ def draw_timeline(flight: FlightData) -> Iterator[Drawing]:
 
 
 def describe_lanes(flight: FlightData) -> str:
-    """Return a sentence on what each lane shows."""
+    """Return a sentence on the meaning of each lane."""
     return f"What a lane shows: {'; '.join(f'“{lane.name}”: {lane.meaning}' for lane in make_lanes(flight))}."
 
 

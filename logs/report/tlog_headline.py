@@ -1,6 +1,6 @@
-"""Headline of a `.tlog` or a ULog: rules that find causes in what the vehicle said and was sent while it was armed.
+"""Headline of a `.tlog` or a ULog: rules that find causes in messages from and to the armed vehicle.
 
-Such a recording knows neither room nor mission, and seldom who asked for a mode.
+Such a recording holds neither room nor mission, and seldom the requester of a mode.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SEVERITIES = {  # of MAV_SEVERITY; the others are notices
     **dict.fromkeys(("emergency", "alert", "critical", "error"), Severity.ERROR),
     "warning": Severity.WARNING,
 }
-_MAX_DISAGREEMENT_M = 0.5  # between its own position and those sent, beyond what their origins differ by
+_MAX_DISAGREEMENT_M = 0.5  # between its own position and those sent, beyond the offset of their origins
 _MAX_INTERPOLATION_S = 0.5  # between two of its own positions, to interpolate one in between
 _HEARTBEAT_S = 1.0  # between two heartbeats
 _ESTIMATOR_TIMEOUT_S = 5.0  # without a position: the soonest at which vehicles' estimators were seen to give up
@@ -65,7 +65,7 @@ class ArmedFlight(NamedTuple):
 
 
 def derive_tlog_headline(flight: MavlinkFlight) -> Headline:
-    """Return what matters most in a flight of a foreign recording, while the vehicle was armed."""
+    """Return the headline of a foreign recording, from the time while the vehicle was armed."""
     info = flight.info
     if info.vehicle_system is None:
         return make_headline([Finding(Cause.NO_VEHICLE, 0.0, "the recording holds no heartbeat of an autopilot")])

@@ -29,7 +29,7 @@ class ClockVerdict(msgspec.Struct, frozen=True, kw_only=True):
     samples: int  # positions that were stamped by it
     counted: int  # times that the offset was reported
     offset_s: float | None  # at the end
-    drift_ppm: float | None  # what our clock gained on the peer's, by the offsets
+    drift_ppm: float | None  # gain of our clock on the peer's, by the offsets
     told_drift_ppm: float | None  # as the synchronisation reported it at the end
     residual_us: float | None  # of the offsets about a straight line, root mean square
     largest_residual_us: float | None

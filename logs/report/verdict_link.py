@@ -51,7 +51,7 @@ class DelayVerdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LinkVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Link as measured at the flown boundaries, against what the design counts on."""
+    """Link as measured at the flown boundaries, against the design's assumption."""
 
     refuted: bool
     text: str

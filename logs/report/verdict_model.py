@@ -66,7 +66,7 @@ def compute_power_bounds(counts: Array, tests: int) -> Array:
 
 
 LAGS = 20
-MIN_ERRORS = 30  # errors of an axis below which nothing is said
+MIN_ERRORS = 30  # fewest errors of an axis for a verdict
 ELLIPSOID_PROBABILITY = 0.95
 _TESTS_PER_AXIS = 3  # mean, spread, whiteness
 

@@ -76,7 +76,7 @@ def judge_risk(flight: FlightData, config: Config | None) -> RiskVerdict:
 
 
 def _to_risk(likelihood: float | None) -> float | None:
-    """Return 1 - likelihood, rounded to what people write: 0.05, not 0.050000000000000044."""
+    """Return 1 - likelihood, rounded as people write it: 0.05, not 0.050000000000000044."""
     return None if likelihood is None else round(1.0 - likelihood, 12)
 
 

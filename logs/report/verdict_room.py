@@ -10,9 +10,9 @@ from logs.recording.summary import RELATIVE_TOLERANCE, count
 
 
 class RoomVerdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Promise for a flight, and what the flown boundaries show."""
+    """Promise for a flight, and the observation at flown boundaries."""
 
-    promised: str | None  # what rehearsed flights did, in words; None where none were rehearsed
+    promised: str | None  # result of rehearsed flights, in words; None where none were rehearsed
     steps: int  # flown boundaries whose position is known
     outside: int  # of these, beyond a limit of the position
     beyond_m: float | None  # furthest beyond a limit; negative: the least distance kept [m]. None: not known

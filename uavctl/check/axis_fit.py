@@ -20,7 +20,7 @@ _MIN_EXTENT_RATIO = 0.05  # a movement whose third extent is below this part of 
 
 @dataclass(frozen=True)
 class Mistake:
-    """A way in which a camera set-up is commonly wrong: what it is, and its matrix."""
+    """A common mistake of a camera set-up: its name, and its matrix."""
 
     name: str
     matrix: Array

@@ -7,7 +7,7 @@ from uavctl.check.findings import Item, ItemState, make_item
 from uavctl.config.types import Config
 from uavctl.mavlink.clocksync import ROUND_TRIP_MARGIN_NS, TimesyncClock
 
-_MAX_DRIFT_PPM = 500.0  # crystals keep 100; what is above is a simulator, or a broken clock
+_MAX_DRIFT_PPM = 500.0  # crystals keep 100; a larger drift is a simulator, or a broken clock
 _MAX_REJECTED_SHARE = 0.5  # part of the answers
 _WANT = f"TIMESYNC answered within {ROUND_TRIP_MARGIN_NS * 1e-6:.0f} ms"
 
@@ -23,7 +23,7 @@ def check_clocks(data: CheckData, config: Config) -> list[Item]:
 
 
 def _judge_missing_answers(config: Config) -> tuple[ItemState, str]:
-    """Return how bad it is that the vehicle does not answer, and what to do."""
+    """Return the severity of a vehicle that does not answer, and the remedy."""
     if config.relay.enabled:
         return (ItemState.BAD, "does the link carry our messages to the vehicle? Positions of [relay] go the same way")
     return ItemState.NOTE, "does the link carry our messages to the vehicle? Setpoints go the same way"

@@ -28,11 +28,11 @@ _ANY = "any value"
 
 
 class ParameterVerdict(NamedTuple):
-    """Verdict on a parameter's value, and what is wanted in its place with the other parameters as they are."""
+    """Verdict on a parameter's value, and the wanted value with the other parameters as they are."""
 
     state: ItemState
     want: str
-    hint: str = ""  # what to do with this value here; empty is the hint of the rule
+    hint: str = ""  # remedy for this value; empty is the hint of the rule
 
 
 ParameterJudge = Callable[[float, ParameterGetter, Config], ParameterVerdict]
@@ -40,7 +40,7 @@ ParameterJudge = Callable[[float, ParameterGetter, Config], ParameterVerdict]
 
 @dataclass(frozen=True)
 class Rule:
-    """One parameter: how its value is judged, and what to do about another one."""
+    """One parameter: the rule for its value, and the remedy."""
 
     name: str
     hint: str
@@ -96,10 +96,10 @@ def _find_runaways(config: Config) -> list[Runaway]:
 
 
 def _make_timeout_judge(lowest_s: float) -> ParameterJudge:
-    """Judge the silence for which the last acceleration goes on: from rest in its middle, the room has to hold that.
+    """Return the judge of a timeout: until it the last acceleration continues, and the room has to hold that.
 
     Args:
-        shortest_s: timeout that the autopilot does not go below [s].
+        lowest_s: timeout that the autopilot does not go below [s].
     """
 
     def judge(value: float, _get: ParameterGetter, config: Config) -> ParameterVerdict:

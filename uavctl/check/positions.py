@@ -144,7 +144,7 @@ def _check_age(data: CheckData, config: Config) -> Item:
 
 
 def _check_loss(captured_s: list[float], config: Config) -> Item:
-    """Steps without a position, which is what the design counts on (1 - p)."""
+    """Judge the share of steps without a position against the design's (1 - p)."""
     link, dt_s, name = config.link, config.plant.dt_s, "position loss"
     expected = link.loss ** max(1, math.floor(config.source.rate_hz * dt_s))
     want = f"at most {expected:.0%} of the steps of {dt_s:g} s without a position (link.loss)"

@@ -77,7 +77,7 @@ class Preflight:
         return Received(answers, from_vehicle, from_source)
 
     def tick(self, tick: int, at_ns: int, send: Send) -> None:
-        """Send what is due at `at_ns`: heartbeats, TIMESYNC, relayed positions and requests; nothing that moves."""
+        """Send messages due at `at_ns`: heartbeats, TIMESYNC, relayed positions and requests; nothing that moves."""
         del tick
         for name, link in self._links.items():
             for data in link.due(at_ns):

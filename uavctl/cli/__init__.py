@@ -36,7 +36,7 @@ def main() -> None:
         finish_streams()
         # At its end the interpreter would kill itself by the signal, if that came while a dataclass was made.
         os._exit(INTERRUPTED)
-    except BrokenPipeError:  # who read standard output has gone
+    except BrokenPipeError:  # the reader of standard output has gone
         discard_output()
         code = 1
     except Exception:  # noqa: BLE001 an error that nobody expected

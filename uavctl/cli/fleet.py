@@ -58,7 +58,7 @@ File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] t
 
 
 class FleetVehicle(Section, frozen=True, kw_only=True):
-    """A vehicle of a fleet: its configuration, and what differs from it."""
+    """A vehicle of a fleet: its configuration, and the overrides."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]+$", max_length=MAX_NAME_LENGTH)]
     config: str = "room"  # a preset, or a TOML file beside this one

@@ -236,7 +236,7 @@ def wait_for_server(stopped: Callable[[], bool]) -> Callable[[str], bool]:
 
 
 def print_losses(status: RecorderStatus) -> None:
-    """Print after a flight what the recording lacks, and why."""
+    """Print after a flight the gaps of the recording, and their cause."""
     if status.failures or not status.ok:
         missing = count_missing_records(status)
         missing_files = find_missing_files(status)

@@ -191,7 +191,7 @@ log_app = App(
     help_epilogue=format_example("log"),
     help_format="markdown",
 )
-# A module is imported when its command runs: a replay does not load what draws pages.
+# A module is imported when its command runs: a replay does not load the drawing of pages.
 _COMMANDS = {
     "replay": (
         "replay:replay",
@@ -271,7 +271,7 @@ def _add_headline(recording_headline: Headline | None, info: msgspec.Struct) -> 
 
 @log_app.command(help_epilogue=format_example("log recover"))
 def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
-    """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
+    """Restore the readable records of a torn or damaged recording. Exit code 3: with loss."""
     result = recover_recording(flight, out)
     Common(json=json).show("log/recover", result, lambda: _make_recover_table(result, out))
     return 0 if result.lossless else RECOVERED_WITH_LOSS

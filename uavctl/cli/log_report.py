@@ -162,7 +162,7 @@ def _rehearse_flown(flight: FlightData, rehearsals: int | None) -> str | None:
         check = replace(check, rehearsals=rehearsals)
     try:
         risk = compute_flight_risk(replace(config, check=check, duration_s=len(flight.steps) * flight.design.dt_s))
-    except DesignError:  # this version refuses what an older one flew
+    except DesignError:  # this version refuses the older configuration
         return None
     return None if risk is None else risk.sentence
 

@@ -61,7 +61,7 @@ def replay(
 
 
 def _list_warnings(replayed: ReplayOutcome) -> Iterator[str]:
-    """Return what limits the comparison."""
+    """Return the limits of the comparison."""
     result = replayed.result
     yield from (f"{text}: decisions may differ" for text in replayed.other_versions)
     if result.dropped:

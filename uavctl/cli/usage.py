@@ -121,7 +121,7 @@ def _describe_missing(error: MissingArgumentError) -> str:
 def format_usage_line(app: App, chain: Sequence[str]) -> str:
     """Return the usage of a command in one line."""
     command = _find_command(app, chain)
-    from cyclopts.help import format_usage  # loads what draws: only for this error
+    from cyclopts.help import format_usage  # loads the drawing: only for this error
 
     text = command.usage or str(format_usage(app, chain))
     return f"usage: {text.strip().removeprefix('Usage: ')}"

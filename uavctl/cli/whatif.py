@@ -225,7 +225,7 @@ def _make_link(request: WhatIfRequest, recorded: Header, before: Config, history
 
 
 def _list_changes(request: WhatIfRequest) -> tuple[str, ...]:
-    """Return what differs, as it was given."""
+    """Return the overrides, as given."""
     return (
         *((f"--config {request.config}",) if request.config else ()),
         *request.overrides,

@@ -45,7 +45,7 @@ class CameraSystem:
     package: str  # package that it imports beyond ours; empty for none
     extra: str  # our optional dependency group that installs the package
     port: int  # of its server, if a URL names none; 0: a URL has to
-    advice: str  # what to check if no answer comes
+    advice: str  # hint if no answer comes
     up: Literal["y", "z"] = "y"  # the vertical axis without a statement in the URL
 
 
@@ -69,7 +69,7 @@ CAMERA_SYSTEMS = {
 }
 SOURCE_GROUP = "uavctl.sources"  # entry points of those of other packages
 _TRANSPORTS = ("udpin", "udpout", "tcp", "serial")  # MAVLink as it is
-CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # as what their positions come to the controller
+CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # message of their positions
 
 
 def parse_camera_scheme(url: str) -> str:
@@ -194,7 +194,7 @@ def check_security(security: SecurityConfig) -> Iterator[ConfigProblem]:
 
 
 def find_security_warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
-    """Return warnings of what a valid configuration leaves open to strangers; for people, before a flight."""
+    """Return warnings of access that a valid configuration leaves to strangers; for people, before a flight."""
     urls = {"vehicle": daemon.vehicle, "mocap": daemon.mocap}
     if daemon.vehicle == daemon.mocap:
         del urls["mocap"]

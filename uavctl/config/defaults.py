@@ -77,7 +77,7 @@ def _count_columns(rows: object) -> int:
 
 
 def _get_entry(values: object, index: int, default: float) -> float:
-    """An entry of a list of numbers; what is none, or not finite, is `otherwise`."""
+    """Return an entry of a list of numbers; `default` if it is no finite number."""
     value = values[index] if isinstance(values, Sequence) and 0 <= index < len(values) else None
     is_number = isinstance(value, int | float) and abs(value) <= 1e7
     return float(value) if is_number else default  # type: ignore[arg-type]

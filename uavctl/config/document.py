@@ -42,7 +42,7 @@ _MAX_REPORTED = 5  # places reported one by one
 
 _MAX_PATH_LENGTH = MAX_DEPTH * (MAX_KEY_LENGTH + 1)  # of a key path that has a line [characters]
 
-# Strings and comments, in which marks mean nothing, or a mark. A string without its end goes on to the end of its line
+# Strings and comments, in which marks mean nothing, or a mark. A string without its end extends to the end of its line
 # or of the text: a pattern that fails there would begin again at every later quote, and take quadratic time.
 _MARK = re.compile(
     r'''
@@ -79,7 +79,7 @@ def find_excess(text: str) -> tuple[int, str] | None:
         if match.lastgroup == "dot":
             dots += 1
             values += dots > 1  # each is a table; a number has one dot at most
-        elif match.lastgroup not in (None, "string"):  # between strings the same key goes on
+        elif match.lastgroup not in (None, "string"):  # between strings the same key continues
             dots = 0
         if depth > MAX_DEPTH or dots >= MAX_DEPTH or values > MAX_VALUES:
             line = text.count("\n", 0, match.start()) + 1
@@ -287,7 +287,7 @@ MAX_NUMBER = 1e7  # of numbers that have no range of their own
 MAX_DURATION_S = 1e6
 MAX_PATH_LENGTH, MAX_URL_LENGTH = 1000, 300
 MAX_STATES = 24  # states
-MAX_SEED = 2**53  # what JSON holds exactly
+MAX_SEED = 2**53  # largest integer that JSON holds exactly
 MAX_SPANS = 1000
 MAX_TRAJECTORY_SAMPLES = 10_000  # samples of a trajectory; a recording holds them
 
@@ -361,7 +361,7 @@ class Source:
 
 
 def _iterate_enclosing(key: str) -> Iterator[str]:
-    """A key path, and those of what is around it."""
+    """Yield a key path, and those of its parents."""
     while key:
         yield key
         key = key[: max(key.rfind("."), key.rfind("["), 0)]

@@ -145,7 +145,7 @@ _TYPE_NAMES = {
 _MAY_BE_INFINITE = ("sets.", "link.trace_s")  # an open side, a lost packet; everything else is finite
 _MAX_VALUE_LENGTH = 40
 _UNKNOWN = "unknown key"
-# Keys of before that have no meaning any more, and why; values of before, with why and what to write instead.
+# Former keys without a meaning, with the reason; former values, with the reason and the replacement.
 _REMOVED = {
     "solver.exact": "it had a meaning with the policy library only, which is gone",
     "log.stop_bytes": "a recording continues until the disk is full",
@@ -175,7 +175,7 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     """Load a preset or a TOML file, apply `key.path=value` overrides, check everything.
 
     Raises:
-        ConfigError: With all problems found, one a line: place, key, reason, what to do.
+        ConfigError: With all problems found, one a line: place, key, reason, remedy.
     """
     file, text = _read_text(name_or_path)
     return parse(text, file, overrides)
@@ -356,7 +356,7 @@ def _read_text(name_or_path: str) -> tuple[str, str]:
 
 
 def parse_toml(text: str, file: str) -> dict[str, Any]:
-    """The table of a TOML text.
+    """Return the table of a TOML text.
 
     Raises:
         ConfigError: It is no TOML, or more than any file of ours; file and line are named.
@@ -418,7 +418,7 @@ def _override(table: dict[str, Any], text: str, problems: list[str]) -> tuple[st
 
 
 def _override_value(text: str) -> object:
-    """A value as TOML writes it; what is none is a string without its quotes."""
+    """Return a value as TOML writes it; any other is a string without its quotes."""
     try:
         parsed = tomllib.loads(f"value = {text}")
     except ValueError:

@@ -151,7 +151,7 @@ _HEADING = re.compile(
 
 
 class StatedColumn(NamedTuple):
-    """Place of a quantity in the rows, and what a number there is multiplied by."""
+    """Column of a quantity in the rows, and the factor of its numbers."""
 
     column: int
     factor: float
@@ -167,7 +167,7 @@ def parse_heading(cell: str) -> tuple[str, float, str] | None:
 
 
 def read_header(cells: Sequence[str]) -> tuple[dict[str, StatedColumn], list[str]]:
-    """The columns of a header by quantity, and its errors."""
+    """Return the columns of a header by quantity, and its errors."""
     columns: dict[str, StatedColumn] = {}
     problems: list[str] = []
     for index, cell in enumerate(cells):
@@ -184,7 +184,7 @@ def read_header(cells: Sequence[str]) -> tuple[dict[str, StatedColumn], list[str
     return columns, problems
 
 
-# A cell of a header, without separators outside of brackets. A bracket without its end goes on to the end of the line:
+# A cell of a header, without separators outside of brackets. A bracket without its end extends to the end of the line:
 # a pattern that fails there would begin again at every later bracket, and take quadratic time.
 _HEADER_CELL = re.compile(r"(?:[^,\s\[(]|[\[(][^\])]*[\])]?)+")
 
@@ -228,10 +228,10 @@ def _make_default_columns(width: int) -> list[StatedColumn]:
 def _read_columns(
     path: Path, rows: list[tuple[int, list[str]]]
 ) -> tuple[list[StatedColumn], list[tuple[int, list[str]]]]:
-    """The columns by a header, none without one, and the rows below it.
+    """Return the columns by a header, none without one, and the rows below it.
 
     Raises:
-        DataFileError: The header states what is not known, or not all that is needed.
+        DataFileError: The header has unknown columns, or lacks required ones.
     """
     if not rows or any(_parse_number(cell) is not None for cell in rows[0][1]):
         return [], rows

@@ -1,1 +1,1 @@
-"""The flight daemon and what stands around a flight: orders, health, lock, real time."""
+"""The flight daemon and its services: orders, health, lock, real time."""

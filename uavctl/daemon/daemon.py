@@ -175,7 +175,7 @@ class _Flight:
             time.sleep(ANSWER_PAUSE_NS * 1e-9)
 
     def report_refusals(self) -> None:
-        """Report what the connections have dropped since the last report."""
+        """Report the data that connections have dropped since the last report."""
         try:
             self._reporter.report(self._now(), is_last=True)
         except Exception as error:  # noqa: BLE001 not needed for flying
@@ -293,7 +293,7 @@ class _Reader:
         return self._complete_read_ns is not None and self._now() - self._complete_read_ns <= MAX_READ_AGE_NS
 
     def wait(self, until_ns: int, wait_for: Callable[[Mapping[str, Connection], int], list[str]]) -> None:
-        """Wait until a time, and pass on what arrives meanwhile."""
+        """Wait until a time, and pass on messages that arrive meanwhile."""
         while True:
             has_received = self.read(wait_for(self._connections, until_ns))
             if self._now() >= until_ns:
@@ -366,7 +366,7 @@ class _Reader:
 
 
 class _RefusalReporter:
-    """Reports to the loop once a second what the connections dropped."""
+    """Reports to the loop once a second the data that connections dropped."""
 
     def __init__(
         self, loop: ControlLoop, connections: Mapping[str, Connection], on_events: Callable[[tuple[Event, ...]], None]

@@ -49,7 +49,7 @@ class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
     last_s: float | None  # since the last one; None before the first
     alone: bool  # nothing else is sent any more: control has ended, or failed
     silent_for: str = ""  # reason why the vehicle has got none for half a second; empty while it gets them
-    attitude_fault: str = ""  # what is wrong with the attitude of poses, which are kept back; empty while it is right
+    attitude_fault: str = ""  # error of the attitude of poses, which are held back; empty without one
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):

@@ -23,7 +23,7 @@ from uavctl.loop import ControlLoop
 from uavctl.mavlink.landing import LandingTarget
 from uavctl.records import Ticked
 
-_PERIOD_NS = SECOND_NS // 2  # of what the process is given
+_PERIOD_NS = SECOND_NS // 2  # of a message to the process
 REQUESTS = 20  # signed ones; each has its own time stamp
 SIGN_OF_LIFE, END = b".", b"end"
 
@@ -47,7 +47,7 @@ class LandingGuard:
         helper.socket.setblocking(False)
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """Give a sign of life, or what a landing needs. Without room nothing is given."""
+        """Send a sign of life, or the data for a landing; drop it if the socket is full or closed."""
         del lateness_ns
         at_ns = ticked.decision.at_ns
         with suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):

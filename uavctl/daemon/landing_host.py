@@ -1,6 +1,6 @@
 """Process that asks for landing if the flight dies, started as `python -m uavctl.daemon.landing_host FEED ...`.
 
-1. Take what a landing needs from FEED, the number of a socket; see `uavctl.daemon.landing_guard`.
+1. Read the data for a landing from FEED, the number of a socket; see `uavctl.daemon.landing_guard`.
 2. Kill the flight's process if it gives no sign of life for `SILENCE_S`: a process that does no tick hears no pilot.
 3. Once it has died, read the vehicle's messages, and ask it to land until it has accepted, or does not fly for us.
 4. Report the end of the flight, the answer to the landing request, and the recording.
