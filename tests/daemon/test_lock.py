@@ -169,7 +169,7 @@ def test_a_lock_file_that_is_none_is_not_followed(tmp_path: Path) -> None:
     target = tmp_path / "precious"
     target.write_text("kept")
     name.symlink_to(target)
-    with pytest.raises(VehicleTakenError, match="see to the file"), lock_vehicle(URL, tmp_path):
+    with pytest.raises(VehicleTakenError, match="check the file"), lock_vehicle(URL, tmp_path):
         pytest.fail("the link was followed")
     assert target.read_text() == "kept"
 
