@@ -193,7 +193,7 @@ def _make_status_table(health: Health) -> Table:
     vehicle, recorder = health.vehicle, health.recorder
     rows = {
         "mode": "waiting" if health.mode is None else f"{health.mode.value}: {health.reason}",
-        "who flies": health.who_flies or "-",
+        "in control": health.who_flies or "-",
         **({"ending": health.ending} if health.ending else {}),
         **({} if health.relay is None else {"relay": describe_relay(health.relay)}),
         "age": "-" if health.age_s is None else f"{health.age_s:.2f} s ({health.age_steps} steps)",

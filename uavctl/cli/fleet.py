@@ -402,7 +402,7 @@ def _make_status_table(health_by_name: HealthByName) -> Table:
                 "-" if position is None else ", ".join(f"{value:+.2f}" for value in position.values()),
             ]
         )
-    headings = ("vehicle", "mode", "who flies", "autopilot", "age", "position NED [m]")
+    headings = ("vehicle", "mode", "in control", "autopilot", "age", "position NED [m]")
     return make_table("", headings, rows, headings[:4], fold=True)
 
 
