@@ -29,7 +29,6 @@ from uavctl.smpc.conditioned.adaptation import (
     SpreadState,
     charge_risk,
     compute_outside_risk,
-    compute_widening,
     count_age,
     count_innovation,
 )
@@ -197,7 +196,7 @@ def fly(
                     age=age,
                     cov=preview.cov,
                     level=ages.level if budgets == "observed" else CERTIFICATE_LEVEL,
-                    widening=compute_widening(loop, spread.spread),
+                    widening=loop.widening,
                     silence_widening=loop.silence_widening,
                 )
             plan, begun = solver.solve(0, mean, target, preview), k

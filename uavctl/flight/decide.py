@@ -270,8 +270,7 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
     target, preview = make_question(controller.mission, mission, context.boundary_ns)
     is_first = is_led(controller.mission, mission, context.boundary_ns)
-    spread = phase.state.estimator.sources.spread.spread
-    preview = set_risk(preview, phase.state.risk, controller.risk, spread, is_led=is_first)
+    preview = set_risk(preview, phase.state.risk, controller.risk, is_led=is_first)
     preview = _complete_preview(preview, base, cov, phase)
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask_solver(controller.solver, context.step, base, target, preview, shape, controller.design_id)

@@ -325,10 +325,13 @@ def _judge_sample(
 def _count_innovation(
     kalman: Kalman, spread: SpreadState, innovations: Array, corrected: PositionSample, belief: Belief
 ) -> SpreadState:
-    """Count the innovations (n_axes,) of a position for the spread."""
+    """Count the innovations (n_axes,) of a position for the spread, where they show more than the camera's noise."""
     index = kalman.measured_index[: len(innovations)]
+    predicted, noise = belief.cov[index, index], read_measurement(kalman, corrected)[1][: len(index)]
+    if predicted.sum() < noise.sum():
+        return spread
     # s² = P + R
-    variances = belief.cov[index, index] + read_measurement(kalman, corrected)[1][: len(index)]
+    variances = predicted + noise
     return count_innovation(spread, innovations.tolist(), variances.tolist())
 
 

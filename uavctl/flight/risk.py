@@ -21,14 +21,7 @@ from uavctl.flight.risk_state import RiskGroup, RiskParameters
 from uavctl.flight.supervise import Supervised
 from uavctl.records import Event, Plan, RiskRecord, Severity
 from uavctl.smpc.answer import CONFIGURED_LEVEL, Preview
-from uavctl.smpc.conditioned.adaptation import (
-    AgeRecord,
-    LoopState,
-    charge_risk,
-    compute_outside_risk,
-    compute_widening,
-    count_age,
-)
+from uavctl.smpc.conditioned.adaptation import AgeRecord, LoopState, charge_risk, compute_outside_risk, count_age
 from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL
 
 # The first positions of a source do not show its clock yet: a few round trips take two seconds, and the smallest delay
@@ -36,13 +29,10 @@ from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL
 SETTLING_NS = 2_000_000_000
 
 
-def set_risk(
-    preview: Preview, risk: RiskGroup, parameters: RiskParameters | None, spread: float, *, is_led: bool
-) -> Preview:
+def set_risk(preview: Preview, risk: RiskGroup, parameters: RiskParameters | None, *, is_led: bool) -> Preview:
     """Set the level of a plan, and the factors of its deviations.
 
     Args:
-        spread: v, by which disturbances differ from the model's.
         is_led: Whether one horizontal axis leads. Beside a limit the budgets of a lower level move the other one as
             well: then a frame whose axes are swapped shows nothing along the diagonal.
     """
@@ -51,9 +41,8 @@ def set_risk(
     level = CONFIGURED_LEVEL if is_led else _select_level(risk.ages, parameters)
     if not parameters.adapts:
         return msgspec.structs.replace(preview, level=level)
-    return msgspec.structs.replace(
-        preview, level=level, widening=compute_widening(risk.loop, spread), silence_widening=risk.loop.silence_widening
-    )
+    widening, silence_widening = risk.loop.widening, risk.loop.silence_widening
+    return msgspec.structs.replace(preview, level=level, widening=widening, silence_widening=silence_widening)
 
 
 def _select_level(ages: AgeRecord, parameters: RiskParameters) -> int:

@@ -45,7 +45,6 @@ from uavctl.wiring.controller import build_estimator
 from uavctl.wiring.rehearsal import MAX_STEPS, make_rehearsal_start
 
 CONFIDENCE = 0.95  # of the bound of the probability
-_SPREAD = 1.0  # v: disturbances are those of the model
 _ROUNDING_M = 1e-9  # beyond a limit by less is rounding
 
 
@@ -256,7 +255,7 @@ class _Pilot:
             self._parameters,
             margins,
             variances,
-            _SPREAD,
+            spread=1.0,  # disturbances are those of the model
             horizon=self._design.horizon,
             keeps_away=self._keeps_away and bool(len(self._plan)),
         )
@@ -266,7 +265,7 @@ class _Pilot:
         target, preview = make_question(self._mission, self._state, k * self._dt_ns)
         sent = self._sent + bias if bias.size else self._sent
         question = Preview(limits=preview.limits, path=preview.path, age=k - capture, cov=cov, sent=sent)
-        question = set_risk(question, self._risk, self._parameters, _SPREAD, is_led=False)
+        question = set_risk(question, self._risk, self._parameters, is_led=False)
         answer = self._design.solver.solve(k, x, target, question)
         if answer.status is SolveStatus.OPTIMAL:
             self._keeps_away = answer.offset > 0.0

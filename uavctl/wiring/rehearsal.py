@@ -165,7 +165,7 @@ def _fly_mission(
         request = Preview(
             limits=preview.limits, path=preview.path, age=age_steps, cov=design.estimate_cov, sent=last_input
         )
-        request = set_risk(request, risk, controller.risk, spread=1.0, is_led=False)
+        request = set_risk(request, risk, controller.risk, is_led=False)
         answer = design.solver.solve(k, x, target, request)
         positions_m.append(x[index])
         relaxed += bool(answer.relaxed)

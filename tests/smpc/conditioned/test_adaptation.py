@@ -152,13 +152,6 @@ def test_quiet_steps_alone_take_no_more_than_a_bounded_share_of_the_distances() 
     assert state.widening == adaptation.MIN_WIDENING
 
 
-def test_plans_count_on_smaller_deviations_only_where_the_spread_is_surely_smaller() -> None:
-    state = LoopState(log_widening=math.log(1.5))
-    spreads = [2.0, 1.0, adaptation.SURE_SPREAD, 0.6, adaptation.MIN_SPREAD, 0.1]
-    widenings = [adaptation.compute_widening(state, spread) for spread in spreads]
-    assert widenings == pytest.approx([1.5, 1.5, 1.5, 1.125, 0.75, 0.75], abs=0.006)
-
-
 def test_safe_steps_far_from_limits_lower_f_to_one_and_no_further() -> None:
     state = charge_risk(LoopState(), 1.0, ALLOWED, keeps_away=False, is_behind_horizon=False)
     assert state.widening > 1.0

@@ -10,9 +10,9 @@
        log f <- log f + γ (r_k / α - 0.93)
 
    As long as f is within its bounds, the mean of r_k over T steps is at most α (0.93 + log(f_max / f_min) / (γ T)).
-4. *Spread.* r_k counts on the standard deviations of the model times v: v² is the mean of the squares of the
-   positions' innovations over that of their variances. Without v, a disturbance larger than the model's would hide in
-   silence. Where v is surely below 1, plans count on smaller deviations, too: f min(1, v / 0.8) takes the place of f.
+4. *Spread.* r_k counts on the standard deviations of the model times v >= 0.8: v² is the mean of the squares of
+   the positions' innovations over that of their variances. Without v, a disturbance larger than the model's would hide
+   in silence.
 5. *Silence.* Behind the horizon H no plan flies, and the spread grows on from where the last one ends. So the end of a
    plan, of information H steps old, keeps a further factor g, with r_k counted where information is that old or older:
 
@@ -45,17 +45,17 @@ GAIN = 0.002  # γ: an error of f falls to half in some 100 steps; 0.004 costs 6
 # of half a second at full speed would take f to its largest value, for the whole approach
 FIRST_STEPS = 60.0
 # Least f: a bound on what quiet steps alone may take from back-offs and distances. 0.75 costs 8 % with 30 % losses in
-# runs of 10, and 10 % with 10 %
-MIN_WIDENING = 0.4
+# runs of 10, and 10 % with 10 %. With 0.3 vehicles were outside in 15 % of the first 10 s in which gusts and runs of
+# losses began together
+MIN_WIDENING = 0.5
 # First g: the spread grows with the square root of time, so the end of a plan holds for a silence of 4 H steps. What is
 # learnt after the first silence comes too late on a link with long runs of losses
 FIRST_SILENCE_WIDENING = 2.0
 SILENCE_TARGET = 0.5  # share of α that ages behind the horizon may use: as much as those that plans fly in
 SPREAD_GAIN = 0.01  # weight of an innovation: v² of 100 of them is known to 14 %
 MOST_SQUARE = 16.0  # most that an innovation counts: one beyond four standard deviations tells of a wrong position
-MIN_SPREAD = 0.4  # least v that counts: a bound on what quiet air alone may take from back-offs and distances
-# v below which disturbances are surely smaller than the model's: its noise is 5 to 14 %. With 1 it would cost 1 %
-SURE_SPREAD = 0.8
+# Least v that the risk counts: the noise of v is 5 %, and cut at 1 it would leave a tenth of the allowed risk unused
+MIN_SPREAD = 0.8
 MAX_WIDENING = 4.0  # largest f: beyond it plans leave most of the room, and f tells more of a wrong model than of risk
 # Least divisor: keeps divisions of empty records finite
 TINY = 1e-300
@@ -160,16 +160,6 @@ def _charge_silence(state: LoopState, relative_risk: float, gain: float) -> floa
     return min(max(log_widening, 0.0), math.log(MAX_WIDENING))
 
 
-def compute_widening(state: LoopState, spread: float) -> float:
-    """Compute the factor of a plan's deviations, rounded: plans of one value share their preparation.
-
-    Args:
-        spread: v, by which disturbances differ from the model's.
-    """
-    # f min(1, max(0.4, v) / 0.8)
-    return round(math.exp(state.log_widening) * min(1.0, max(MIN_SPREAD, spread) / SURE_SPREAD), 2)
-
-
 class SpreadState(msgspec.Struct, frozen=True):
     """State of the spread: weighted means of the positions' innovations, in the position's unit squared."""
 
@@ -203,5 +193,5 @@ def compute_outside_risk(margins: Array, variances: Array, spread: float) -> flo
     Args:
         spread: v, counted where it is above MIN_SPREAD.
     """
-    # r = min(1, Σ_i Φ(-m_i / (max(0.4, v) σ_i)))
+    # r = min(1, Σ_i Φ(-m_i / (max(0.8, v) σ_i)))
     return min(1.0, float(compute_violation_risk(margins, max(MIN_SPREAD, spread) * np.sqrt(variances)).sum()))
