@@ -251,3 +251,20 @@ def test_a_silence_is_braked_on_the_last_own_velocity_that_was_right(right_mps: 
         if state.mode is not ControlMode.BRAKE:
             break
     assert state.plan.sent_mps2[0] * right_mps < 0.0
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("is_silent", [True, False])
+def test_where_velocities_point_against_each_other_fresh_positions_are_braked_on(is_silent: bool) -> None:
+    ours, back = controller(), 5 + make_controller().horizon + 1
+    steps = [*range(5), *([] if is_silent else range(back, back + 3))]
+    times_ns = {step: START_NS + step * DT_NS - 50 * MS for step in steps}
+    samples = [
+        sample(at_ns, at_ns + 20 * MS, position_m=(0.2 * step, 0.0, 0.0), velocity_mps=(1.0, 0.0, 0.0))
+        for step, at_ns in times_ns.items()
+    ]
+    state = make_initial_state()
+    for inp in make_inputs(range((back + 1) * TICKS), samples):
+        state, _ = run_tick(state, replace(inp, motion=motion((-1.0, 0.0, 0.0), inp.at_ns)), ours)
+    assert state.mode is ControlMode.BRAKE
+    assert (state.plan.sent_mps2[0] > 0.0) == is_silent

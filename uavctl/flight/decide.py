@@ -436,21 +436,24 @@ def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, su
 def find_braking_velocity(context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
     """Find the velocity to brake on, and whether it is the vehicle's own.
 
-    Else it is the predicted one. Where inertial data carry that on and both point against each other, it is their mean:
-    one of them is wrong, and would accelerate the vehicle. Where only setpoints carry it on, and the own velocity was
-    right until a moment ago, it is that velocity and what setpoints have changed since: it is newer than the last
-    position.
+    Else it is the predicted one. Where both point against each other, one of them is wrong, and would accelerate the
+    vehicle: then it is the one that recent positions show, or their mean where inertial data carry the prediction on.
+    Where only setpoints do, and the own velocity was right until a moment ago, it is that velocity and what setpoints
+    have changed since: it is newer than the last position.
     """
     estimate, plant, monitors = supervised.view.estimate, context.controller.plant, supervised.monitors.engaged
-    predicted = read_velocity(estimate, plant)
+    predicted, belief = read_velocity(estimate, plant), supervised.view.belief
     observation = observe_velocity(monitors, estimate, context)
     if observation is not None and observation.own_mps is not None and judge_vehicle_velocity(observation).is_none:
         own = _select_known(observation.own_mps, plant)
         # v_own' v_predicted < 0
-        if _is_inertial_new(supervised.view.belief) and sum(map(operator.mul, own, predicted)) < 0.0:
-            own = _select_known([0.5 * (v + known) for v, known in zip(own, predicted, strict=True)], plant)
+        if sum(map(operator.mul, own, predicted)) < 0.0:
+            if not are_positions_lost(belief, context.at_ns):
+                own = predicted
+            elif _is_inertial_new(belief):
+                own = _select_known([0.5 * (v + known) for v, known in zip(own, predicted, strict=True)], plant)
         return own, True
-    right, belief = monitors.velocity_change.right_beside_model_mps, supervised.view.belief
+    right = monitors.velocity_change.right_beside_model_mps
     if right is None or _is_inertial_new(belief) or not are_positions_lost(belief, context.at_ns):
         return predicted, False
     # v = (v_0 - m_0) + m

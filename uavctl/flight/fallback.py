@@ -14,7 +14,8 @@ A state machine of four modes, each with a time limit:
     LAND                   LAND once its zero has been sent
 
 1. Braking goes by the vehicle's own velocity where that may be believed (`uavctl.flight.monitors.vehicle_velocity`),
-   else by the predicted one; by the mean of both where inertial data carry that on, and they point against each other.
+   else by the predicted one. Where they point against each other, it brakes by what recent positions show, or by the
+   mean of both where inertial data carry the prediction on.
    By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold runs on.
 2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. By a
    prediction from inputs alone the vehicle brakes only until that is slow.
