@@ -85,9 +85,9 @@ def test_without_inertial_data_setpoints_support_the_velocity(
     states = fly(80, own, lambda _s, _a: None)
     assert states[-1].supports_velocity(START_NS + 79 * TICK_NS) == supports
     assert {is_found(state) for state in states} == {(False, False)}
-    # Over less than half a second they say nothing, nor beside a source that was found wrong.
+    # Over less than half a second they say nothing, nor of an own velocity that was found wrong.
     assert all(state.agreed_ns is None for state in states[:10])
-    wrong = VelocityChangeState(inertial_wrong_ns=START_NS)
+    wrong = VelocityChangeState(velocity_wrong_ns=START_NS)
     assert all(state.agreed_ns is None for state in fly(50, own, lambda _s, _a: None, state=wrong))
 
 
@@ -360,6 +360,12 @@ def test_setpoints_support_the_velocity_within_gusts_from_half_a_second_on(
 ) -> None:
     state = compare(north(own_mps), None, ns=ns, first=(ZERO, None, ZERO))
     assert (state.agreed_ns == START_NS + ns) == is_supported and state.disagrees_ns is None
+    # Inertial data that were found wrong count as none.
+    wrong = compare(north(own_mps), north(9.0), ns=ns, inertial_wrong_ns=START_NS)
+    assert (wrong.agreed_ns == START_NS + ns) == is_supported
+    assert wrong.disagrees_ns == (START_NS if is_found(wrong) == (True, True) else None)
+    both = compare(north(own_mps), north(9.0), ns=ns, inertial_wrong_ns=START_NS, velocity_wrong_ns=START_NS)
+    assert (both.agreed_ns, both.velocity_wrong_ns) == (None, START_NS)
 
 
 def test_samples_of_the_last_second_are_compared_each_once() -> None:

@@ -3,7 +3,7 @@
 1. Over the last second, or since they last were compared, three changes of the velocity are known: of the vehicle's own
    velocity (Δv), the integral of its inertial data (Δi), and what the setpoints give (Δm). None needs a position.
 2. Δv and Δi that are near each other are both right: then positions that contradict them are wrong. Without inertial
-   data, so is a Δv that is as near to Δm as gusts explain.
+   data, or where these are wrong, so is a Δv that is as near to Δm as gusts explain.
 3. Else the one that is further from Δm is wrong, with or without the acceleration d that positions showed last beside
    the setpoints; both are, if both are further than gusts explain. Where Δv is known to be wrong, only Δi is compared.
 4. An own velocity that repeats to the last bit while Δm grows is wrong, too. So is one that leaps from one message to
@@ -72,7 +72,7 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
         return self.has_found_wrong or self.disagrees_ns is not None
 
     def supports_velocity(self, at_ns: int) -> bool:
-        """Whether inertial data, or setpoints without any, have changed as the own velocity has, just now."""
+        """Whether inertial data, or setpoints without right ones, have changed as the own velocity has, just now."""
         return self.velocity_wrong_ns is None and self.agreed_ns is not None and at_ns - self.agreed_ns <= RECENT_NS
 
 
@@ -125,22 +125,25 @@ def _compare(
     # e > v_max + gusts(t), or twice that
     gusts_mps = parameters.disagreement_mps + bound_gusts_mps(s, parameters)
     explained_mps = 2.0 * gusts_mps
+    is_right = own_mps <= gusts_mps and state.velocity_wrong_ns is None
+    supported = replace(state, agreed_ns=at_ns if is_right and s >= LEAST_S else state.agreed_ns, disagrees_ns=None)
     if first[2] is None or last[2] is None:
-        is_supported = s >= LEAST_S and own_mps <= gusts_mps and not state.has_found_wrong
-        return replace(state, agreed_ns=at_ns if is_supported else state.agreed_ns, disagrees_ns=None)
+        return supported
     gained = _subtract(last[2], first[2])
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t
     if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
         return replace(state, agreed_ns=at_ns, disagrees_ns=None)
+    right_mps = _subtract(first[1], first[3])
+    if state.inertial_wrong_ns is not None:
+        if is_right:
+            return supported
+        if state.velocity_wrong_ns is not None:
+            return state
+        return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps)
     disagrees_ns = at_ns if state.disagrees_ns is None else state.disagrees_ns
     if at_ns - disagrees_ns < PERSISTS_NS:
         return replace(state, disagrees_ns=disagrees_ns)
     gained_mps = min(math.dist(gained, model), math.dist(gained, pushed))
-    right_mps = _subtract(first[1], first[3])
-    if state.inertial_wrong_ns is not None:
-        if state.velocity_wrong_ns is not None or own_mps <= gusts_mps:
-            return state
-        return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps)
     if state.velocity_wrong_ns is not None:
         return replace(state, inertial_wrong_ns=at_ns if gained_mps > explained_mps else None)
     are_both_wrong = min(own_mps, gained_mps) > explained_mps
