@@ -9,9 +9,11 @@
    mean since the last seconds: a wind that sets in makes one, too. Older samples are forgotten.
 4. The evidence for a wrong response is the log-likelihood ratio of V and J against those of a right one. Where R = I
    leaves little, nothing else is compared.
-5. Evidence above a bound ends the plans. The bound is lower where little time is left to brake before a wall, and
+5. A response that has just become wrong shows sooner in the last 0.3 or 0.4 s alone, all samples alike: what setpoints
+   gave at their begin still fades with the vehicle's lag.
+6. Evidence above a bound ends the plans. The bound is lower where little time is left to brake before a wall, and
    lowest while the fallback brakes and positions come: a wrong response would accelerate the vehicle for a second.
-6. Inertial data count only while the vehicle's own velocity changes as they do. Where no own velocity comes, positions
+7. Inertial data count only while the vehicle's own velocity changes as they do. Where no own velocity comes, positions
    are witness. Nothing counts while both sources contradict each other: one of them is wrong.
 
 Positions are right, so they go on to the vehicle.
@@ -34,9 +36,10 @@ from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
+from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import MOTION_NS, EnvelopeParameters, Observation, read_vehicle_velocity
-from uavctl.flight.monitors.observer import DRAG_1PS, measure_size_mps2, remove_drag
+from uavctl.flight.monitors.observer import DRAG_1PS, MIN_LAG_S, measure_size_mps2, remove_drag
 from uavctl.flight.monitors.outside import REACTION_S, describe_overrun, list_approaches
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
@@ -58,6 +61,9 @@ LITTLE = 5.0
 # Factor of the bounds for the vehicle's own velocity, which its estimator smooths, and with no position for so long:
 # inertial data and the own velocity that begin to err together would be taken for a wrong response.
 UNCERTAIN, SILENT_NS = 3.0, 400_000_000
+# Times since a response may have become wrong: over a longer one gusts look like it, a shorter one shows too little.
+# Factor of the bounds for it: a wind of 2 m/s² that sets in at once makes evidence of 3.8.
+ONSETS_NS, ONSET = (300_000_000, 400_000_000), 1.5
 WITNESSED = 2.5  # the same where positions are the witness: sudden winds of 5 to 8 m/s² make evidence of up to 7.4
 # Of the acceleration that positions may show unexplained: from there on they are witness of inertial data. A choice:
 # more than noise of positions shows, less than a wrong response does in half a second.
@@ -74,7 +80,10 @@ Sample = tuple[int, tuple[float, ...]]
 
 
 class _Group:
-    """Hypotheses on axes that are compared together; e = a - R_0 u - R_1 u_late - R_2 u_too_late is what one leaves."""
+    """Hypotheses on axes that are compared together.
+
+    What one leaves is e = a - R_0 u - R_1 u_late - R_2 u_too_late - R_3 f, with f of setpoints before, which fades.
+    """
 
     def __init__(self, axes: Sequence[int], wrong: dict[str, Array], rare: dict[str, Array]) -> None:
         """Make the group.
@@ -84,14 +93,15 @@ class _Group:
             rare: The same, for those near to a right one.
         """
         one, zero = np.eye(len(axes)), np.zeros((len(axes), len(axes)))
-        right = [(gain * one, zero, zero) for gain in GAINS] + [(zero, gain * one, zero) for gain in GAINS]
-        rows = [*right, (zero, zero, one)]
-        rows += [(r, zero, zero) for r in (wrong | rare).values()]
+        right = [(gain * one, zero, zero, zero) for gain in GAINS] + [(zero, gain * one, zero, zero) for gain in GAINS]
+        rows = [*right, (zero, zero, one, zero)]
+        # a = R u + (I - R) f, as u = f + what was sent since gives
+        rows += [(r, zero, zero, one - r) for r in (wrong | rare).values()]
         self.axes = tuple(axes)
         self.kinds = ("too late", *wrong, *rare)
         self.right = len(right)
         self.offsets = [0.0] * (len(rows) - len(rare)) + [RARE] * len(rare)
-        # What each leaves is e = L s of s = (a, u, u_late, u_too_late): L (k, d, 4 d), and L'L (k, 16 d²)
+        # What each leaves is e = L s of s = (a, u, u_late, u_too_late, f): L (k, d, 5 d), and L'L (k, 25 d²)
         self.left = np.array([np.hstack([one, *(-r for r in row)]) for row in rows])
         self.squares = (self.left.transpose(0, 2, 1) @ self.left).reshape(len(rows), -1)
 
@@ -167,6 +177,9 @@ def update(
     factor = UNCERTAIN
     if by_inertial and not is_silent:
         factor = 1.0 if is_supported else WITNESSED
+    if factor == 1.0:
+        onset, onset_kind = compute_onset_evidence(state, observation.parameters)
+        evidence, kind = max((evidence, kind), (onset / ONSET, onset_kind))
     is_urgent = tick.braking and not is_silent
     bound = NEAR if is_urgent else _compute_bound(tick, observation.parameters)
     if evidence <= factor * bound:
@@ -248,24 +261,59 @@ def compute_evidence(state: ResponseState, unexplained_mps2: float) -> tuple[flo
         return best
     noise_mps2, jump_mps2 = NOISE_PART * unexplained_mps2, JUMP_PART * unexplained_mps2
     for group in _GROUPS:
-        if _leaves_little(state, group, noise_mps2, jump_mps2):
-            continue
-        costs = _compute_costs(state, group, noise_mps2, jump_mps2)
-        wrong = costs[group.right :]
-        least = min(wrong)
-        best = max(best, (min(costs[: group.right]) - least, group.kinds[wrong.index(least)]))
+        if _compute_exact_cost(state.recent, state.baseline, group, noise_mps2, jump_mps2) > LITTLE:
+            best = max(best, _compare(_compute_costs(state, group, noise_mps2, jump_mps2), group))
     return best
 
 
-def _leaves_little(state: ResponseState, group: _Group, noise_mps2: float, jump_mps2: float) -> bool:
-    """Whether an exact response leaves so little that no other needs to be compared: a check at little cost."""
-    count, before = state.recent[0], state.baseline
-    variance = jumped = 0.0
+def compute_onset_evidence(state: ResponseState, parameters: EnvelopeParameters) -> tuple[float, str]:
+    """Compute the evidence for the likeliest response that has just become wrong, and its kind.
+
+    It is zero where a right one leaves no more than the least bound: no evidence can be larger.
+    """
+    noise_mps2, jump_mps2 = NOISE_PART * parameters.unexplained_mps2, JUMP_PART * parameters.unexplained_mps2
+    best, newest_ns = (0.0, ""), state.samples[-1][0]
+    for onset_ns in ONSETS_NS:
+        since_ns = newest_ns - onset_ns
+        numbers = [sample for at_ns, sample in state.samples if at_ns > since_ns]
+        if state.samples[0][0] > since_ns or len(numbers) < LEAST_SAMPLES:
+            continue
+        recent = _sum_samples(numbers)
+        for group in _GROUPS:
+            if _compute_exact_cost(recent, state.baseline, group, noise_mps2, jump_mps2) > ONSET * NEAR:
+                costs = _compute_costs(state, group, noise_mps2, jump_mps2, since_ns, parameters.lag_s)
+                best = max(best, _compare(costs, group))
+    return best
+
+
+def _sum_samples(numbers: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
+    """Sum samples alike: w, w e (3), w e² (3), with e of a right response."""
+    weights = [sample[0] for sample in numbers]
+    left = [[sample[1 + axis] - sample[4 + axis] for sample in numbers] for axis in range(3)]
+    return (
+        sum(weights),
+        *(sum(w * e for w, e in zip(weights, row, strict=True)) for row in left),
+        *(sum(w * e * e for w, e in zip(weights, row, strict=True)) for row in left),
+    )
+
+
+def _compare(costs: list[float], group: _Group) -> tuple[float, str]:
+    """Compare the likeliest wrong response with the likeliest right one: the evidence for it, and its kind."""
+    wrong = costs[group.right :]
+    least = min(wrong)
+    return min(costs[: group.right]) - least, group.kinds[wrong.index(least)]
+
+
+def _compute_exact_cost(
+    recent: Sequence[float], baseline: Sequence[float], group: _Group, noise_mps2: float, jump_mps2: float
+) -> float:
+    """Compute the cost of an exact response, without drag: where it is little, no other needs to be compared."""
+    count, variance, jumped = recent[0], 0.0, 0.0
     for axis in group.axes:
-        mean = state.recent[1 + axis] / count
-        variance += state.recent[4 + axis] / count - mean * mean
-        jumped += (mean - before[1 + axis] / before[0]) ** 2
-    return _compute_cost(count, max(variance, 0.0), jumped, noise_mps2, jump_mps2) <= LITTLE
+        mean = recent[1 + axis] / count
+        variance += recent[4 + axis] / count - mean * mean
+        jumped += (mean - baseline[1 + axis] / baseline[0]) ** 2
+    return _compute_cost(count, max(variance, 0.0), jumped, noise_mps2, jump_mps2)
 
 
 def _compute_cost(count: float, variance: float, jumped: float, noise_mps2: float, jump_mps2: float) -> float:
@@ -273,8 +321,20 @@ def _compute_cost(count: float, variance: float, jumped: float, noise_mps2: floa
     return 0.5 * count * math.log(1.0 + variance / noise_mps2**2) + jumped / (2.0 * jump_mps2**2)
 
 
-def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_mps2: float) -> list[float]:
-    """Compute the negative log-likelihood of each hypothesis of a group."""
+def _compute_costs(
+    state: ResponseState,
+    group: _Group,
+    noise_mps2: float,
+    jump_mps2: float,
+    since_ns: int | None = None,
+    lag_s: Vec3 = ZERO,
+) -> list[float]:
+    """Compute the negative log-likelihood of each hypothesis of a group.
+
+    Args:
+        since_ns: Time since a response has been wrong; None for a long time, of which older samples are forgotten.
+        lag_s: The vehicle's lag, with which what was asked for before then fades.
+    """
     samples, axes, newest_ns = np.array([numbers for _, numbers in state.samples]), group.axes, state.samples[-1][0]
     # Relative to the newest sample: a difference of two is exact.
     at_ns, requested_ns = (np.array([ns - newest_ns for ns, _ in rows]) for rows in (state.samples, state.requested))
@@ -284,11 +344,20 @@ def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_
         for ns in (LATE_NS, TOO_LATE_NS)
     ]
     accel, now, velocity = (samples[:, [first + axis for axis in axes]] for first in (1, 4, 7))
-    weights = samples[:, 0] * np.exp(at_ns * (1e-9 / MEMORY_S))
+    if since_ns is None:
+        weights, faded = samples[:, 0] * np.exp(at_ns * (1e-9 / MEMORY_S)), np.zeros_like(now)
+    else:
+        onset_ns = since_ns - newest_ns
+        before = requested[max(int(np.searchsorted(requested_ns, onset_ns, side="right")) - 1, 0)]
+        lags_s = np.maximum([lag_s[axis] for axis in axes], MIN_LAG_S)
+        # f = u(t_0) e^(-(t - t_0) / τ)
+        is_since = at_ns > onset_ns
+        weights = samples[:, 0] * is_since
+        faded = before * np.exp(-np.maximum(at_ns - onset_ns, 0)[:, None] * 1e-9 / lags_s)
     count = float(weights.sum())
     weights = weights / count
-    # s = (a, u, u late, u too late), and v behind: s̄ = Σ w s, C = Σ w (s - s̄)(s - s̄)'
-    shown, n_s = np.hstack([accel, now, *delayed, velocity]), group.left.shape[2]
+    # s = (a, u, u late, u too late, f), and v behind: s̄ = Σ w s, C = Σ w (s - s̄)(s - s̄)'
+    shown, n_s = np.hstack([accel, now, *delayed, faded, velocity]), group.left.shape[2]
     mean_shown = weights @ shown
     centred = shown - mean_shown
     cov = (weights * centred.T) @ centred
@@ -296,9 +365,9 @@ def _compute_costs(state: ResponseState, group: _Group, noise_mps2: float, jump_
     variance = (group.squares @ cov[:n_s, :n_s].ravel()).tolist()
     covariance = (group.left.reshape(len(group.left), -1) @ cov[n_s:, :n_s].ravel()).tolist()
     variance_v = float(cov[n_s:, n_s:].trace())
-    before = [total / state.baseline[0] for total in state.baseline]
-    jump = group.left @ mean_shown[:n_s] - [before[1 + axis] for axis in axes]
-    change_mps = mean_shown[n_s:] - [before[4 + axis] for axis in axes]
+    long = [total / state.baseline[0] for total in state.baseline]
+    jump = group.left @ mean_shown[:n_s] - [long[1 + axis] for axis in axes]
+    change_mps = mean_shown[n_s:] - [long[4 + axis] for axis in axes]
     squared, along = (jump * jump).sum(axis=1).tolist(), (jump @ change_mps).tolist()
     squared_v = float(change_mps @ change_mps)
     # V = var e + 2 c cov(e, v) + c² var v; J = |Δē + c Δv̄|²; each with the best c
