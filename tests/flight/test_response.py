@@ -377,24 +377,43 @@ def find_request(state: ResponseState, at_ns: int) -> Vec3:
     return next((u for ns, u in reversed(state.requested) if ns <= at_ns), state.requested[0][1])
 
 
-def compute_evidence_slowly(state: ResponseState, unexplained_mps2: float) -> tuple[float, str]:
-    """Compute the evidence by its definition, one hypothesis and one sample after the other."""
+def compute_evidence_slowly(
+    state: ResponseState, unexplained_mps2: float, lag_s: Vec3 | None = None
+) -> tuple[float, str]:
+    """Compute the evidence by its definition, one hypothesis and one sample after the other.
+
+    Args:
+        lag_s: The vehicle's lag, where the response has been wrong for 0.35 s; None where for long.
+    """
     newest_ns, before = state.samples[-1][0], np.array(state.baseline) / state.baseline[0]
-    weights = np.array([one[0] * math.exp((at_ns - newest_ns) * 1e-9 / 0.4) for at_ns, one in state.samples])
+    ages_s = [(newest_ns - at_ns) * 1e-9 for at_ns, _ in state.samples]
+    kept = [math.exp(-age_s / 0.4) if lag_s is None else float(age_s < 0.35) for age_s in ages_s]
+    weights = np.array([one[0] * part for part, (_, one) in zip(kept, state.samples, strict=True)])
     count, weights = float(weights.sum()), weights / weights.sum()
+    fades = np.zeros((len(ages_s), 3))
+    if lag_s is not None:
+        began = find_request(state, newest_ns - 350 * MS)
+        for row, age_s in enumerate(ages_s):
+            fades[row] = [
+                u * math.exp(-max(0.35 - age_s, 0.0) / max(lag, 1e-3)) for u, lag in zip(began, lag_s, strict=True)
+            ]
     best = 0.0, ""
     for axes, wrong in (((0, 1), WRONG_HORIZONTAL), ((2,), WRONG_VERTICAL)):
         one, chosen = np.eye(len(axes)), list(axes)
 
-        def compute_cost(r: np.ndarray, late_ns: int, dragged: bool = True, chosen: list[int] = chosen) -> float:
+        def compute_cost(
+            r: np.ndarray, late_ns: int, dragged: bool = True, is_wrong: bool = False, chosen: list[int] = chosen
+        ) -> float:
             accel, now, velocity = (
                 np.array([row[k : k + 3] for _, row in state.samples])[:, chosen] for k in (1, 4, 7)
             )
             asked = [find_request(state, at_ns - late_ns) for at_ns, _ in state.samples]
             u = np.array(asked)[:, chosen] if late_ns else now
 
+            fading = fades[:, chosen] @ (np.eye(len(chosen)) - r).T if is_wrong and not late_ns else np.zeros_like(u)
+
             def left(drag_1ps: float) -> np.ndarray:
-                return np.asarray(accel - u @ r.T + drag_1ps * velocity)
+                return np.asarray(accel - u @ r.T - fading + drag_1ps * velocity)
 
             def vary(drag_1ps: float) -> float:
                 e = left(drag_1ps)
@@ -408,10 +427,12 @@ def compute_evidence_slowly(state: ResponseState, unexplained_mps2: float) -> tu
             noise, jumps = 0.2 * unexplained_mps2, 0.65 * unexplained_mps2
             return 0.5 * count * math.log(1.0 + variance / noise**2) + 0.5 * jumped / jumps**2
 
-        if compute_cost(one, 0, dragged=False) <= 5.0:
+        if compute_cost(one, 0, dragged=False) <= (5.0 if lag_s is None else 1.5 * 1.4):
             continue
         right = min(compute_cost(gain * one, late_ns) for gain, late_ns in RIGHT)
-        least, kind = min((compute_cost(r, late_ns) + cost, kind) for kind, (r, late_ns, cost) in wrong.items())
+        least, kind = min(
+            (compute_cost(r, late_ns, is_wrong=True) + cost, kind) for kind, (r, late_ns, cost) in wrong.items()
+        )
         best = max(best, (right - least, kind))
     return best
 
@@ -455,6 +476,12 @@ def test_the_evidence_is_that_of_its_definition(kind: str, late_ns: int) -> None
         state, unexplained_mps2 = make_state(rng, answers, late_ns, rng.uniform(0.0, 2.0)), rng.choice([0.6, 1.0, 1.5])
         evidence, found = response.compute_evidence(state, unexplained_mps2)
         slow, slow_found = compute_evidence_slowly(state, unexplained_mps2)
+        assert evidence == pytest.approx(slow, rel=1e-9)
+        assert found == slow_found
+        lag_s: Vec3 = (float(rng.uniform(0.1, 0.5)), float(rng.uniform(0.1, 0.5)), float(rng.choice([0.0, 0.3])))
+        parameters = replace(ROOM, unexplained_mps2=unexplained_mps2, lag_s=lag_s)
+        evidence, found = response.compute_onset_evidence(state, parameters)
+        slow, slow_found = compute_evidence_slowly(state, unexplained_mps2, lag_s)
         assert evidence == pytest.approx(slow, rel=1e-9)
         assert found == slow_found
 
@@ -570,6 +597,73 @@ def test_plans_end_beyond_a_bound_by_what_is_witness_and_how_near_a_wall_is(
     limit = factor * (1.4 if braking and is_heard else bound)
     assert not ends_plans(monkeypatch, limit, tick, observer, change, heard_ns)
     assert ends_plans(monkeypatch, just_more(limit), tick, observer, change, heard_ns)
+
+
+@pytest.mark.parametrize(
+    ("tick", "heard_ns", "change", "counts"),
+    [
+        (FELT, START_NS, CONSISTENT, True),
+        (FELT, None, CONSISTENT, False),  # no position comes
+        (FELT, START_NS, INITIAL, False),
+        (seen(START_NS, vehicle_motion=motion(ZERO, START_NS)), START_NS, CONSISTENT, False),  # no inertial data
+    ],
+)
+@pytest.mark.parametrize(("north_m", "bound"), [(0.0, 3.0), (3.0, 1.4)])
+def test_what_has_just_become_wrong_takes_half_as_much_again(
+    tick: Observation,
+    heard_ns: int | None,
+    change: VelocityChangeState,
+    counts: bool,
+    north_m: float,
+    bound: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tick = structs.replace(tick, position_m=(north_m, 0.0, -2.0), velocity_mps=(0.1, 0.0, 0.0))
+    for evidence, ends in ((1.5 * bound, False), (just_more(1.5 * bound), counts)):
+        monkeypatch.setattr(response, "compute_onset_evidence", lambda *_, found=evidence: (found, "mirrored in north"))
+        assert ends_plans(monkeypatch, 0.0, tick, None, change, heard_ns) == ends
+
+
+def make_onset(left_mps2: list[Vec3], ages_ms: list[int], before_mps2: Vec3 = ZERO) -> ResponseState:
+    """Make the state of a vehicle of which an exact response leaves this, at those ages; nothing has been asked for."""
+    samples = tuple(
+        (START_NS - ms * MS, (1.0, *left, *ZERO, *ZERO)) for left, ms in zip(left_mps2, ages_ms, strict=True)
+    )
+    return ResponseState(
+        requested=((START_NS - 999 * MS, (1.0, 1.0, 1.0)), *((at_ns, ZERO) for at_ns, _ in samples)),
+        samples=samples,
+        baseline=(2.0, *(2.0 * x for x in before_mps2), 0.0, 0.0, 0.0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("ages_ms", "finds"), [([350, 200, 0], True), ([349, 200, 0], False), ([2000, 349, 0], True), ([400, 0], True)]
+)
+def test_the_time_since_a_response_may_be_wrong_must_be_known(ages_ms: list[int], finds: bool) -> None:
+    state = make_onset([(9.0, 9.0, 9.0)] * len(ages_ms), ages_ms)
+    assert (response.compute_onset_evidence(state, ROOM) != (0.0, "")) == finds
+
+
+@pytest.mark.parametrize("axes", [(0,), (1,), (0, 1), (2,)])
+def test_a_response_that_has_just_become_wrong_leaves_a_variance_and_a_jump(axes: tuple[int, ...]) -> None:
+    """2 / 2 ln(1 + V / σ²) + J / 2 σ_J² is just below 2.1, or just above, whatever was before."""
+    before, jump_mps2, parameters = (0.1, 0.2, -0.3), 0.5, replace(ROOM, unexplained_mps2=UNIT_MPS2)
+    jumped = len(axes) * jump_mps2**2 / 2.0
+    std_mps2 = 0.2 * UNIT_MPS2 * math.sqrt(math.expm1(1.5 * NEAR - jumped) / len(axes))
+    for factor, finds in ((1.0 - 1e-6, False), (1.0 + 1e-6, True)):
+        left = [
+            vec3([x + (axis in axes) * (jump_mps2 + sign * factor * std_mps2) for axis, x in enumerate(before)])
+            for sign in (-1.0, 1.0)
+        ]
+        state = make_onset([(9.0, 9.0, 9.0), *left], [350, 200, 0], before)
+        assert (response.compute_onset_evidence(state, parameters) != (0.0, "")) == finds
+
+
+@pytest.mark.fault(101)
+@pytest.mark.parametrize("kind", ["turned by 90°", "turned by 270°", "mirrored in north", "mirrored in east"])
+def test_a_response_that_has_just_become_wrong_is_found_soon(kind: str) -> None:
+    first_s = get_first_s(fly(make_wrong(kind), position_m=(0.0, 0.0, -2.0)))
+    assert first_s is not None and WRONG_S < first_s <= WRONG_S + 0.3
 
 
 @pytest.mark.parametrize(

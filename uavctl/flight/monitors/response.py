@@ -9,8 +9,8 @@
    mean since the last seconds: a wind that sets in makes one, too. Older samples are forgotten.
 4. The evidence for a wrong response is the log-likelihood ratio of V and J against those of a right one. Where R = I
    leaves little, nothing else is compared.
-5. A response that has just become wrong shows sooner in the last 0.3 or 0.4 s alone, all samples alike: what setpoints
-   gave at their begin still fades with the vehicle's lag.
+5. A response that has just become wrong shows sooner in the last 0.35 s alone, all samples alike. What setpoints gave
+   before fades with the vehicle's lag.
 6. Evidence above a bound ends the plans. The bound is lower where little time is left to brake before a wall, and
    lowest while the fallback brakes and positions come: a wrong response would accelerate the vehicle for a second.
 7. Inertial data count only while the vehicle's own velocity changes as they do. Where no own velocity comes, positions
@@ -61,9 +61,9 @@ LITTLE = 5.0
 # Factor of the bounds for the vehicle's own velocity, which its estimator smooths, and with no position for so long:
 # inertial data and the own velocity that begin to err together would be taken for a wrong response.
 UNCERTAIN, SILENT_NS = 3.0, 400_000_000
-# Times since a response may have become wrong: over a longer one gusts look like it, a shorter one shows too little.
+# Time since a response may have become wrong: over a longer one gusts look like it, a shorter one shows too little.
 # Factor of the bounds for it: a wind of 2 m/s² that sets in at once makes evidence of 3.8.
-ONSETS_NS, ONSET = (300_000_000, 400_000_000), 1.5
+ONSET_NS, ONSET = 350_000_000, 1.5
 WITNESSED = 2.5  # the same where positions are the witness: sudden winds of 5 to 8 m/s² make evidence of up to 7.4
 # Of the acceleration that positions may show unexplained: from there on they are witness of inertial data. A choice:
 # more than noise of positions shows, less than a wrong response does in half a second.
@@ -272,17 +272,14 @@ def compute_onset_evidence(state: ResponseState, parameters: EnvelopeParameters)
     It is zero where a right one leaves no more than the least bound: no evidence can be larger.
     """
     noise_mps2, jump_mps2 = NOISE_PART * parameters.unexplained_mps2, JUMP_PART * parameters.unexplained_mps2
-    best, newest_ns = (0.0, ""), state.samples[-1][0]
-    for onset_ns in ONSETS_NS:
-        since_ns = newest_ns - onset_ns
-        numbers = [sample for at_ns, sample in state.samples if at_ns > since_ns]
-        if state.samples[0][0] > since_ns or len(numbers) < LEAST_SAMPLES:
-            continue
-        recent = _sum_samples(numbers)
-        for group in _GROUPS:
-            if _compute_exact_cost(recent, state.baseline, group, noise_mps2, jump_mps2) > ONSET * NEAR:
-                costs = _compute_costs(state, group, noise_mps2, jump_mps2, since_ns, parameters.lag_s)
-                best = max(best, _compare(costs, group))
+    best, since_ns = (0.0, ""), state.samples[-1][0] - ONSET_NS
+    if state.samples[0][0] > since_ns:
+        return best
+    recent = _sum_samples([sample for at_ns, sample in state.samples if at_ns > since_ns])
+    for group in _GROUPS:
+        if _compute_exact_cost(recent, state.baseline, group, noise_mps2, jump_mps2) > ONSET * NEAR:
+            costs = _compute_costs(state, group, noise_mps2, jump_mps2, since_ns, parameters.lag_s)
+            best = max(best, _compare(costs, group))
     return best
 
 
