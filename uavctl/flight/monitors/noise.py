@@ -2,7 +2,8 @@
 
 1. Each position is compared with the line between its neighbours in time; where these are far apart, with the parabola
    through its neighbours and the position before. The median of such residuals is the noise: neither a jump nor a
-   burst of outliers changes a median, and no acceleration, or change of it, bends a path by so much.
+   burst of outliers changes a median, and no acceleration, or change of it, bends a path by so much. Noise that begins
+   in flight would change the median of a slow source too late: there that of the last five counts, if it is larger.
 2. A position counts with that standard deviation where it is larger than `USUAL_STD_M`. Few residuals may show too
    little of it, so they count for more.
 3. What the first residuals show holds for the positions before them, too: taken for exact, two positions with noise of
@@ -27,6 +28,7 @@ LARGEST_STD_M = 0.1  # a camera system that works has no larger noise
 # small, and the median of three two times.
 FEW = 3.0
 _RESIDUALS, _LEAST_RESIDUALS = 15, 3  # a second or so at 20 Hz
+_SLOW_RESIDUALS = 5  # the same at 5 Hz
 # Neighbours whose distances in time have a larger product are too far apart: 4 m/s² bend a path by 0.02 m within it.
 _LARGEST_S2 = 0.01
 # The same for three distances and a parabola: 5 m/s³, the most that setpoints change by, make a residual of 0.025 m
@@ -65,8 +67,11 @@ def update(track: NoiseTrack, sample: PositionSample, at_ns: int) -> NoiseTrack:
     neighbours = _select_neighbours(last, track.is_known)
     if neighbours:
         residuals_m = (*residuals_m, _find_residual_m(last[-2], neighbours))[-_RESIDUALS:]
+    std_m = _estimate_std_m(residuals_m, _RESIDUALS)
+    if not track.is_known:
+        std_m = max(std_m, _estimate_std_m(residuals_m[-_SLOW_RESIDUALS:], _SLOW_RESIDUALS))
     close_count = min(track.close_count + (len(neighbours) == 2), _LEAST_RESIDUALS)
-    return NoiseTrack(last[-3:], residuals_m, _estimate_std_m(residuals_m), close_count)
+    return NoiseTrack(last[-3:], residuals_m, std_m, close_count)
 
 
 def _select_neighbours(last: Sequence[_Place], is_known: bool) -> Sequence[_Place]:
@@ -91,11 +96,15 @@ def _find_residual_m(middle: _Place, others: Sequence[_Place]) -> float:
     return math.hypot(*away_m) / math.sqrt(1.0 + sum(part * part for part in parts))
 
 
-def _estimate_std_m(residuals_m: Sequence[float]) -> float:
-    """Estimate the standard deviation of a position [m]; 0 where too few residuals show it, or it is small."""
+def _estimate_std_m(residuals_m: Sequence[float], largest: int) -> float:
+    """Estimate the standard deviation of a position [m]; 0 where too few residuals show it, or it is small.
+
+    Args:
+        largest: Number of residuals that are enough.
+    """
     if not residuals_m:
         return 0.0
     std_m = median_low(residuals_m) / _MEDIAN_3D
     # σ (1 + FEW (1/n - 1/n_max))
-    few = FEW * (1.0 / len(residuals_m) - 1.0 / _RESIDUALS)
+    few = FEW * (1.0 / len(residuals_m) - 1.0 / largest)
     return min((1.0 + few) * std_m, LARGEST_STD_M) if std_m > USUAL_STD_M else 0.0
