@@ -480,6 +480,8 @@ def test_the_evidence_is_that_of_its_definition(kind: str, late_ns: int) -> None
         assert found == slow_found
         lag_s: Vec3 = (float(rng.uniform(0.1, 0.5)), float(rng.uniform(0.1, 0.5)), float(rng.choice([0.0, 0.3])))
         parameters = replace(ROOM, unexplained_mps2=unexplained_mps2, lag_s=lag_s)
+        last_before = state.samples[-1][0] - 350 * MS, state.samples[-5][1]
+        state = structs.replace(state, samples=(*state.samples[:-5], last_before, *state.samples[-4:]))
         evidence, found = response.compute_onset_evidence(state, parameters)
         slow, slow_found = compute_evidence_slowly(state, unexplained_mps2, lag_s)
         assert evidence == pytest.approx(slow, rel=1e-9)
@@ -657,6 +659,17 @@ def test_a_response_that_has_just_become_wrong_leaves_a_variance_and_a_jump(axes
         ]
         state = make_onset([(9.0, 9.0, 9.0), *left], [350, 200, 0], before)
         assert (response.compute_onset_evidence(state, parameters) != (0.0, "")) == finds
+
+
+@pytest.mark.parametrize(("jump_mps2", "finds"), [(2.0493901531919194, False), (2.04939015319192, True)])
+def test_a_response_is_compared_where_an_exact_one_leaves_more_than_the_least_bound(
+    jump_mps2: float, finds: bool
+) -> None:
+    """2.049...² / 2 is 1.5 · 1.4, to the last bit."""
+    assert (jump_mps2**2 / 2.0 == 1.5 * NEAR) != finds
+    state = make_onset([(9.0, 9.0, 9.0), (jump_mps2, 0.0, 0.0), (jump_mps2, 0.0, 0.0)], [350, 200, 0])
+    evidence = response.compute_onset_evidence(state, replace(ROOM, unexplained_mps2=UNIT_MPS2))
+    assert (evidence != (0.0, "")) == finds
 
 
 @pytest.mark.fault(101)

@@ -345,12 +345,12 @@ def _compute_costs(
         weights, faded = samples[:, 0] * np.exp(at_ns * (1e-9 / MEMORY_S)), np.zeros_like(now)
     else:
         onset_ns = since_ns - newest_ns
-        before = requested[max(int(np.searchsorted(requested_ns, onset_ns, side="right")) - 1, 0)]
+        before = requested[int(np.searchsorted(requested_ns, onset_ns, side="right")) - 1]
         lags_s = np.maximum([lag_s[axis] for axis in axes], MIN_LAG_S)
         # f = u(t_0) e^(-(t - t_0) / τ)
         is_since = at_ns > onset_ns
-        weights = samples[:, 0] * is_since
-        faded = before * np.exp(-np.maximum(at_ns - onset_ns, 0)[:, None] * 1e-9 / lags_s)
+        weights, since_s = samples[:, 0] * is_since, (at_ns - onset_ns) * is_since * 1e-9
+        faded = before * np.exp(-since_s[:, None] / lags_s)
     count = float(weights.sum())
     weights = weights / count
     # s = (a, u, u late, u too late, f), and v behind: s̄ = Σ w s, C = Σ w (s - s̄)(s - s̄)'
