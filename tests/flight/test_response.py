@@ -661,6 +661,17 @@ def test_a_response_that_has_just_become_wrong_leaves_a_variance_and_a_jump(axes
         assert (response.compute_onset_evidence(state, parameters) != (0.0, "")) == finds
 
 
+@pytest.mark.parametrize("answer_down", [-1.0, 0.0])
+def test_what_an_exact_response_leaves_is_the_acceleration_less_what_setpoints_give(answer_down: float) -> None:
+    samples = tuple(
+        (START_NS - ms * MS, (1.0, -x, x, answer_down * x, x, -x, x, *ZERO))
+        for ms, x in ((350, 1.5), (300, -1.5), (200, 1.5), (100, -1.5), (0, 1.5))
+    )
+    requested = tuple((at_ns, (row[4], row[5], row[6])) for at_ns, row in samples)
+    state = ResponseState(requested=requested, samples=samples, baseline=(2.0, *[0.0] * 6))
+    assert response.compute_onset_evidence(state, replace(ROOM, lag_s=ZERO))[0] > 1.0
+
+
 @pytest.mark.parametrize(("jump_mps2", "finds"), [(2.0493901531919194, False), (2.04939015319192, True)])
 def test_a_response_is_compared_where_an_exact_one_leaves_more_than_the_least_bound(
     jump_mps2: float, finds: bool
