@@ -195,7 +195,7 @@ def test_too_few_positions_and_no_setpoints_are_refused() -> None:
         return msgspec.structs.replace(record, samples=()) if isinstance(record, StepInput) else record
 
     nothing = [(topic, at_ns, blind(record)) for topic, at_ns, record in fly_case(PAPER).entries]
-    with pytest.raises(RecordingError, match=r"^a: .* 0 positions .* at least 2"):
+    with pytest.raises(RecordingError, match=r"^a: .* 0 positions.* at least 2"):
         make_recorded_flight(nothing, load_case_config(PAPER), "a")
     with pytest.raises(RecordingError, match="never took a setpoint"):
         make_recorded_flight(strip_recording(PAPER, Setpoint), load_case_config(PAPER), "a")
