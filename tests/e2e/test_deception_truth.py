@@ -3,18 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from deception_rig import (
-    BLACKOUT_S,
-    DeceivedFlight,
-    Deception,
-    choose_plant,
-    draw_flight,
-    draw_hover,
-    fly_deceived,
-    prepare_believed,
-)
+from deception_rig import BLACKOUT_S, DeceivedFlight, Deception, draw_flight, draw_hover, fly_deceived
 
-from uavctl.config import load_config
 from uavctl.records import ControlMode
 
 OUTSIDE_M = 0.5  # beyond a wall or the ceiling
@@ -43,13 +33,6 @@ HOVERS = (
     (107, "flipped", "linear"),
     (108, "swapped", "quadrotor"),
     (114, "flipped", "quadrotor"),
-)
-# Flights to and fro before a wall: preset, plant, seed of the world, gusts [m/s], waypoints, begin of the blackout, and
-# when positions begin to be late. They were outside by 0.8 and 0.4 m, as inertial data were doubted for positions that
-# jumped, or a prediction was flown on that inertial data and the own velocity contradict.
-TO_AND_FRO = (
-    ("room-ardupilot", "quadrotor", 1400313, 3.0, "[-0.77,0.66,-0.87],[-2.71,0.66,-0.87]", 5.859, 5.046),
-    ("room-px4", "linear", 1400106, 2.0, "[1.45,0.61,-1.07],[2.82,0.61,-1.07]", 2.594, 2.386),
 )
 WORST_LINEAR = (287, 290, 316, 323)  # of 71 flights of the linear plant, both autopilots
 
@@ -105,24 +88,3 @@ def test_lasting_lies_of_inertial_data_alone_do_not_brake_at_every_lost_position
 def test_a_wrong_velocity_accelerates_no_vehicle_that_hovers_before_a_wall(seed: int, kind: str, plant: str) -> None:
     flight = fly_deceived(*draw_hover(seed, kind, plant))
     assert flight.outside_m <= 0.2
-
-
-@pytest.mark.slow
-@pytest.mark.fault(94)
-@pytest.mark.fault(95)
-@pytest.mark.parametrize(("preset", "plant", "seed", "gusts_mps", "points", "blackout_s", "at_s"), TO_AND_FRO)
-def test_late_positions_before_a_blackout_fly_no_vehicle_into_the_wall(
-    preset: str, plant: str, seed: int, gusts_mps: float, points: str, blackout_s: float, at_s: float
-) -> None:
-    autopilot = preset.removeprefix("room-")
-    waypoints = f"mission.waypoints=[{','.join([points] * 6)}]"
-    world = (
-        f"sim.seed={seed}",
-        f"sim.start_position_m={points.split('],')[0]}]",
-        f"link.blackout=[[{blackout_s}, {blackout_s + BLACKOUT_S}]]",
-        f"duration_s={blackout_s + BLACKOUT_S + 4.5}",
-    )
-    config = load_config(preset, [f"sim.autopilot={autopilot}", *choose_plant(plant, gusts_mps), waypoints, *world])
-    believed, controller = prepare_believed(preset, autopilot, (waypoints,))
-    late = Deception("positions", "delayed", at_s)
-    assert fly_deceived(config, believed, controller, [late], blackout_s).outside_m <= 0.2

@@ -43,7 +43,6 @@ from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity
-from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.supervise import ENVELOPE_CODES
 from uavctl.records import Vec3, VehicleMotion
 
@@ -451,26 +450,6 @@ def test_a_prediction_far_off_the_vehicle_s_own_velocity_misleads(
     watching, tick = told(ZERO, (0.0, -apart_mps, 0.0), apart_mps=0.1)
     assert is_prediction_inconsistent(watching, tick, age_s, PARAMETERS) == inconsistent
     assert not is_prediction_inconsistent(changed(watching, is_contradicted=True), tick, age_s, PARAMETERS)
-
-
-@pytest.mark.fault(94)
-@pytest.mark.parametrize(
-    ("apart_mps", "age_s", "inconsistent"),
-    [
-        (0.375, 0.0, False),  # 1.5 disagreements
-        (0.376, 0.0, True),
-        (0.67, 0.5, False),  # and gusts of half a second
-        (0.68, 0.5, True),
-    ],
-)
-def test_a_prediction_misleads_sooner_where_inertial_data_support_the_velocity(
-    apart_mps: float, age_s: float, inconsistent: bool
-) -> None:
-    supported = VelocityChangeState(agreed_ns=AT_NS)
-    watching, tick = told(ZERO, (0.0, -apart_mps, 0.0), apart_mps=0.1, velocity_change=supported)
-    assert is_prediction_inconsistent(watching, tick, age_s, PARAMETERS) == inconsistent
-    watching, _ = told(ZERO, ZERO, apart_mps=0.1)
-    assert not is_prediction_inconsistent(watching, tick, age_s, PARAMETERS)
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ This is the only table from verdicts to actions. Phase 1 acts on those about sin
 "Consistent" is the capture time of the last position with which all monitors of the motion agreed
 (`MonitorState.consistent_ns`). Positions that are lost make the age grow; at the horizon the fallback brakes.
 
-1. Inertial data are compared with the vehicle's own velocity. Where both change alike, positions that contradict them
-   and came back lately, or jumped, are wrong.
+1. Inertial data are compared with the vehicle's own velocity. Where both change alike, positions that came back lately
+   and contradict them are wrong.
 2. While we fly, the motion is watched; while others fly an armed vehicle, its positions are compared with its inertial
    data, or with its own velocity.
 3. Data that are distrusted are dropped from the filter, and the estimate is made anew.
@@ -72,8 +72,8 @@ ENVELOPE_CODES = POSITION_CODES.union({EventCode.OUTSIDE, EventCode.BRAKING, Eve
 # shorter time, and a burst of losses is shorter.
 LOST_NS = 400_000_000
 NEAR_S = 2.0  # time to a limit up to which a wind that may be a wrong response is no reason to fly on
-# Positions that came back so lately after a silence, or jumped, are wrong where two other sources contradict them.
-# Others may be late by the smoothing of a camera system.
+# Positions that came back so lately after a silence are wrong where two other sources contradict them. Those that never
+# were away may be late by the smoothing of a camera system.
 RETURNED_NS = 4_000_000_000
 PLAYED_OUT_STEPS = 2  # without a position: from there on a prediction is compared with the vehicle's own velocity
 REPLAN_STEPS = 3  # for which a plan is made anew once positions were dropped: the setpoint is slew-limited
@@ -194,18 +194,16 @@ def _judge_estimate(
 ) -> tuple[Verdict, Verdict]:
     """Judge which source is wrong where the estimate contradicts inertial data or the vehicle's own velocity.
 
-    Positions that came back lately, or jumped, are, where both others change alike; else inertial data are. Return both
-    verdicts.
+    Positions that came back lately are, where both others change alike; else inertial data are. Return both verdicts.
     """
     belief, change = view.belief, state.monitors.engaged.velocity_change
     if belief is None:
         return NO_VERDICT, NO_VERDICT
     has_drifted = change.inertial_wrong_ns is None and _has_drifted(state, belief, view, context)
-    resumed_ns, sources = state.monitors.engaged.motion.resumed_ns, measured.samples.sources
+    resumed_ns, knows_noise = state.monitors.engaged.motion.resumed_ns, measured.samples.sources.noise.is_known
     returned_ns = math.inf if resumed_ns is None else context.at_ns - resumed_ns
-    jumped_ns = context.at_ns - sources.jumps.at_ns if any(sources.jumps.compute_shift_m(context.at_ns)) else math.inf
-    is_suspect = min(returned_ns, jumped_ns) < RETURNED_NS and sources.noise.is_measured
-    if is_suspect and change.supports_velocity(context.at_ns):
+    has_returned = returned_ns < RETURNED_NS
+    if has_returned and knows_noise and change.supports_velocity(context.at_ns):
         is_new = any(read_capture_ns(sample) == belief.inertial.distrusted_ns for sample in measured.samples.accepted)
         is_recent = (view.age_steps or 0) < PLAYED_OUT_STEPS
         compares = returned_ns >= CORRECTS_NS

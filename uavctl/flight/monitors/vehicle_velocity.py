@@ -3,8 +3,7 @@
 1. It may be believed if inertial data change as it does (`uavctl.flight.monitors.velocity_change`), or positions agreed
    with it, or the predicted velocity is near it, or (in a flight's first ten seconds) the velocity that setpoints gave
    is. Else: distrust the vehicle's velocity.
-2. Without a position for two steps: a prediction far from it is wrong, and so is a plan of it. Less is far where
-   inertial data support the vehicle's velocity. Then: brake.
+2. Without a position for two steps: a prediction far from it is wrong, and so is a plan of it. Then: brake.
 3. A velocity that inertial data carried on without a position has drifted away from it. Then: distrust inertial data.
 
 These compare without a memory of their own, so each is a `judge(observation) -> Verdict`.
@@ -27,7 +26,6 @@ from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict, brake
 from uavctl.records import Vec3, VehicleMotion
 
 MISLEADS = 4.0  # disagreements between a prediction and the vehicle that gusts alone do not make
-SUPPORTED_MISLEADS = 1.5  # the same where inertial data support the vehicle: the smoothing of cameras makes less
 MODEL_COUNTS_S = 10.0  # of a flight: for so long the setpoints say something of the velocity
 _DISTRUSTED = Verdict(Action.DISTRUST_VEHICLE_VELOCITY, EventCode.VELOCITY)
 
@@ -77,10 +75,7 @@ def find_trusted_velocity(observation: VelocityObservation) -> Vec3 | None:
 def judge_prediction(observation: VelocityObservation) -> Verdict:
     """Judge a prediction without fresh positions by the vehicle's own velocity."""
     velocity, parameters = find_trusted_velocity(observation), observation.parameters
-    is_supported = observation.monitors.velocity_change.supports_velocity(observation.at_ns)
-    times = SUPPORTED_MISLEADS if is_supported else MISLEADS
-    # |v - v_predicted| ≤ n v_max + gusts(age)
-    within_mps = times * parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
+    within_mps = MISLEADS * parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
     if velocity is None or _is_near(velocity, observation.predicted_mps, within_mps):
         return NO_VERDICT
     return brake(
