@@ -1,7 +1,7 @@
 """Fit of a plant to a flight: its parameters, its dead time, and its prediction errors on held-out halves.
 
-1. The parameters of an axis maximise the likelihood of the filter's innovations. The search is L-BFGS-B (Byrd et al.,
-   1995) of SciPy; the slopes of innovations and variances give the gradient, and the expected curvature its scale.
+1. The parameters of an axis maximise the likelihood of the filter's innovations. The search is Fisher scoring with
+   Levenberg-Marquardt damping: the slopes of innovations and variances give gradient and expected curvature at once.
 2. The dead time minimises the deviance of the whole flight, summed over the axes. Prediction errors tell plants apart
    but not dead times: a lag replaces a dead time with hardly a difference at 0.25 s and more.
 3. Plants are compared on halves of the flight. The halves are alternating blocks, so each has a part of every
@@ -13,8 +13,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -22,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import Bounds, minimize
 
 from logs.report.statistics import autocorrelation
 from uavctl.arrays import Array, Flags
@@ -33,7 +31,9 @@ from uavctl.lab.identify.response import (
     TIME_UNIT_S,
     AxisModel,
     FilterResult,
+    Likelihood,
     Timeline,
+    Trial,
     compute_likelihood,
     compute_transition,
     get_values,
@@ -46,7 +46,10 @@ _HESSIAN_STEP = 1e-2
 _DIFFERENCE_STEP = 1e-5  # of the difference quotients: truncation and rounding change no result by a millionth
 # Gain of the deviance by one more step, below which the search ends; a standard error is a gain of 1.
 TOLERANCE, ROUGH_TOLERANCE = 1e-9, 1e-6
-_ROUNDING = 1e-13  # share of the deviance; a smaller gain ends the search too
+_MAX_STEPS = 60
+_MAX_STEP = 1.0  # largest change of a parameter; for a logarithm, a factor of e
+_LINEAR_RANGE = 0.1  # within this step the gradient is about linear
+_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-2, 1e-4, 1e6
 
 
 @dataclass(frozen=True)
@@ -71,21 +74,42 @@ def fit_axes(
     starts: Sequence[Sequence[float] | None],
     tolerance: float = TOLERANCE,
 ) -> tuple[AxisFit, ...]:
-    """Fit some axes with a given dead time, independently.
+    """Fit some axes with a given dead time, independently, in as many passes as the slowest search needs.
 
     Args:
         axes: 0 north, 1 east, 2 down.
-        models: The plant of each axis.
+        models: The plant of each axis, all of one kind.
         dead_time_s: d [s].
         starts: Parameter vector of each axis to begin with; None: the model's starts, and the best result of these.
         tolerance: Gain of the deviance by one more step, below which a search ends.
     """
     parts = [make_timeline(stretch, axes, dead_time_s) for stretch in flown]
+    starting_points = [
+        (axis_index, np.array(vector))
+        for axis_index, (model, start) in enumerate(zip(models, starts, strict=True))
+        for vector in (
+            [make_parameters(model, start_values) for start_values in model.starts] if start is None else [start]
+        )
+    ]
+    searches = [_search_minimum(x, models[axis_index], tolerance) for axis_index, x in starting_points]
+    points = {i: next(search) for i, search in enumerate(searches)}
+    results: dict[int, tuple[Array, float]] = {}
+    while points:
+        slopes = _compute_slopes(
+            parts, [(starting_points[i][0], models[starting_points[i][0]], x) for i, x in points.items()]
+        )
+        for i, slope in zip(list(points), slopes, strict=True):
+            try:
+                points[i] = searches[i].send(slope)
+            except StopIteration as end:
+                results[i] = end.value
+                del points[i]
     fits = []
-    for axis_index, (model, start) in enumerate(zip(models, starts, strict=True)):
-        vectors = [make_parameters(model, values) for values in model.starts] if start is None else [start]
-        minima = [_minimise_deviance(parts, axis_index, model, np.array(vector), tolerance) for vector in vectors]
-        x, deviance = min(minima, key=lambda minimum: minimum[1])
+    for axis_index, model in enumerate(models):
+        x, deviance = min(
+            (results[i] for i, (index, _) in enumerate(starting_points) if index == axis_index),
+            key=lambda result: result[1],
+        )
         fits.append(AxisFit(model, dead_time_s, tuple(x.tolist()), deviance))
     return tuple(fits)
 
@@ -98,13 +122,10 @@ def compute_standard_errors(flown: Sequence[Stretch], axis: int, fit: AxisFit) -
     parts = [make_timeline(stretch, (axis,), fit.dead_time_s) for stretch in flown]
     x = np.array(fit.parameters)
     offsets = _HESSIAN_STEP * np.eye(len(x))
+    slopes = _compute_slopes(parts, [(0, fit.model, x_moved) for x_moved in (*(x + offsets), *(x - offsets))])
+    forward, backward = slopes[: len(x)], slopes[len(x) :]
     rows = [
-        (
-            _compute_slope(parts, 0, fit.model, x + offset).gradient
-            - _compute_slope(parts, 0, fit.model, x - offset).gradient
-        )
-        / (2.0 * _HESSIAN_STEP)
-        for offset in offsets
+        (plus.gradient - minus.gradient) / (2.0 * _HESSIAN_STEP) for plus, minus in zip(forward, backward, strict=True)
     ]
     curvature = (np.array(rows) + np.array(rows).T) / 4.0  # of the log likelihood: half the deviance's
     is_free = np.diag(curvature) > 0.0  # false at a bound, beyond which the deviance may fall further
@@ -129,33 +150,66 @@ class _Slope(NamedTuple):
     curvature: Array
 
 
-def _minimise_deviance(
-    parts: Sequence[Timeline], axis_index: int, model: AxisModel, start: Array, tolerance: float
-) -> tuple[Array, float]:
-    """Minimise the deviance within the bounds of the parameters; return parameter vector and deviance."""
-    lower, upper = np.array([(p.to_search_scale(p.lower), p.to_search_scale(p.upper)) for p in model.free]).T
-    # x = s z, s = √(2 / H): then the deviance rises by about 1 a unit of z, and its slope g means a gain of g² / 4.
-    curvature = np.diag(_compute_slope(parts, axis_index, model, start).curvature)
-    scale = np.sqrt(2.0 / np.maximum(curvature, 2.0))
+def _search_minimum(x: Array, model: AxisModel, tolerance: float) -> Generator[Array, _Slope, tuple[Array, float]]:
+    """Minimise the deviance by damped Newton steps: yield parameter vectors, receive their slopes."""
+    lower, upper = np.array(
+        [
+            (parameter.to_search_scale(parameter.lower), parameter.to_search_scale(parameter.upper))
+            for parameter in model.free
+        ]
+    ).T
+    current, damping = (yield x), _DAMPING
+    for _ in range(_MAX_STEPS):
+        is_free = ~(((x <= lower) & (current.gradient > 0.0)) | ((x >= upper) & (current.gradient < 0.0)))
+        is_free &= np.diag(current.curvature) > 0.0  # a parameter without effect stays unchanged
+        gradient, curvature = current.gradient[is_free], current.curvature[np.ix_(is_free, is_free)]
+        if not is_free.any() or gradient @ _compute_damped_step(curvature, gradient, _MIN_DAMPING) < 2.0 * tolerance:
+            break
+        while damping < _MAX_DAMPING:
+            step = np.zeros(len(x))
+            step[is_free] = -_compute_damped_step(curvature, gradient, damping)
+            trial = np.clip(x + np.clip(step, -_MAX_STEP, _MAX_STEP), lower, upper)
+            next_slope = yield trial
+            if next_slope.deviance < current.deviance:
+                break
+            damping *= 10.0
+        else:
+            break
+        corrected = _correct_curvature(next_slope.curvature, trial - x, next_slope.gradient - current.gradient)
+        x, current, damping = trial, next_slope._replace(curvature=corrected), max(0.1 * damping, _MIN_DAMPING)
+    return x, current.deviance
 
-    def compute_scaled_slope(z: Array) -> tuple[float, Array]:
-        slope = _compute_slope(parts, axis_index, model, np.clip(scale * z, lower, upper))
-        return slope.deviance, scale * slope.gradient
 
-    minimum = minimize(
-        compute_scaled_slope,
-        start / scale,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=Bounds(lower / scale, upper / scale),
-        options={"gtol": 2.0 * math.sqrt(tolerance), "ftol": _ROUNDING},
+def _compute_damped_step(curvature: Array, gradient: Array, damping: float) -> Array:
+    """Return the damped Newton step uphill."""
+    return np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient), dtype=np.float64)
+
+
+def _correct_curvature(curvature: Array, step: Array, change: Array) -> Array:
+    """Return the expected curvature, corrected by the change of the gradient along a step (BFGS)."""
+    # H := H - H s (H s)' / (s' H s) + y y' / (s' y), with step s and change y of the gradient
+    curvature_step = curvature @ step
+    if step @ change <= 0.0 or np.abs(step).max() > _LINEAR_RANGE:
+        return curvature
+    return np.asarray(
+        curvature
+        - np.outer(curvature_step, curvature_step) / (step @ curvature_step)
+        + np.outer(change, change) / (step @ change),
+        dtype=np.float64,
     )
-    return np.clip(scale * minimum.x, lower, upper), float(minimum.fun)
 
 
-def _compute_slope(parts: Sequence[Timeline], axis_index: int, model: AxisModel, x: Array) -> _Slope:
-    """Return the slope at a parameter vector, by finite differences."""
-    result = compute_likelihood(parts, axis_index, model, np.vstack([x, x + _DIFFERENCE_STEP * np.eye(len(x))]))
+def _compute_slopes(parts: Sequence[Timeline], points: Sequence[tuple[int, AxisModel, Array]]) -> list[_Slope]:
+    """Return the slope at each of some (index of the axis, model, parameter vector), all in one pass."""
+    trials = [
+        Trial(axis_index, model, np.vstack([x, x + _DIFFERENCE_STEP * np.eye(len(x))]))
+        for axis_index, model, x in points
+    ]
+    return [_compute_slope(result) for result in compute_likelihood(parts, trials)]
+
+
+def _compute_slope(result: Likelihood) -> _Slope:
+    """Return the slope by finite differences of the other parameter vectors from the first."""
     std = np.sqrt(result.variances_m2[:, 0])
     innovation_slopes = (result.innovations_m[:, 1:] - result.innovations_m[:, :1]) / (_DIFFERENCE_STEP * std[:, None])
     # The slope of an outlier's Huber loss is constant.

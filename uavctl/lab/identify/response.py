@@ -280,6 +280,14 @@ class FilterResult:
     covs: Array  # (m, n, n), covariance of the corrected state
 
 
+class Trial(NamedTuple):
+    """Parameter vectors of an axis whose likelihood is computed."""
+
+    axis_index: int  # column of the axis in the timeline
+    model: AxisModel  # all trials of one pass have the same number of states
+    parameters: Array  # (k, l)
+
+
 class Likelihood(NamedTuple):
     """Likelihood of an axis' positions under k parameter vectors."""
 
@@ -317,27 +325,35 @@ def make_timeline(stretch: Stretch, axes: Sequence[int], dead_time_s: float) -> 
     )
 
 
-def compute_likelihood(parts: Sequence[Timeline], axis_index: int, model: AxisModel, parameters: Array) -> Likelihood:
-    """Return the likelihood of an axis over all parts under k parameter vectors.
+def compute_likelihood(parts: Sequence[Timeline], trials: Sequence[Trial]) -> tuple[Likelihood, ...]:
+    """Return the likelihood of each trial over all parts, computed in one pass."""
+    counts = [len(trial.parameters) for trial in trials]
+    axis_indices = np.repeat([trial.axis_index for trial in trials], counts)
+    motion = LinearMotion(
+        *map(np.concatenate, zip(*(trial.model.motion(trial.parameters) for trial in trials), strict=True))
+    )
+    noise_variance = np.concatenate([get_noise_variance(trial.model, trial.parameters) for trial in trials])
+    passes = [_run_pass(part, axis_indices, motion, noise_variance, trials[0].model.start_std) for part in parts]
+    bounds = np.cumsum([0, *counts])
 
-    Args:
-        axis_index: Column of the axis in the timelines.
-        parameters: (k, l).
-    """
-    motion, noise_variance = model.motion(parameters), get_noise_variance(model, parameters)
-    passes = [_run_pass(part, axis_index, motion, noise_variance, model.start_std) for part in parts]
-    return Likelihood(
-        deviances=np.sum([result.deviances for result in passes], axis=0),
-        innovations_m=np.concatenate([r.innovations_m[p.counts_for_fit] for r, p in zip(passes, parts, strict=True)]),
-        variances_m2=np.concatenate([r.variances_m2[p.counts_for_fit] for r, p in zip(passes, parts, strict=True)]),
+    def select_counted(rows: Sequence[Array]) -> list[Array]:
+        return [row[part.counts_for_fit] for row, part in zip(rows, parts, strict=True)]
+
+    return tuple(
+        Likelihood(
+            deviances=np.sum([trial.deviances[begin:end] for trial in passes], axis=0),
+            innovations_m=np.concatenate(select_counted([trial.innovations_m[:, begin:end] for trial in passes])),
+            variances_m2=np.concatenate(select_counted([trial.variances_m2[:, begin:end] for trial in passes])),
+        )
+        for begin, end in pairwise(bounds)
     )
 
 
 def run_filter(part: Timeline, model: AxisModel, parameters: Array) -> FilterResult:
     """Return states and innovations of one part's first axis under one parameter vector (l,)."""
-    motion = model.motion(parameters[None])
-    result = _run_pass(part, 0, motion, get_noise_variance(model, parameters[None]), model.start_std)
-    driven = _compute_driven_states(part, 0, motion)[:, 0]
+    motion, axis_indices = model.motion(parameters[None]), np.zeros(1, dtype=np.int64)
+    result = _run_pass(part, axis_indices, motion, get_noise_variance(model, parameters[None]), model.start_std)
+    driven = _compute_driven_states(part, axis_indices, motion)[:, 0]
     return FilterResult(
         driven,
         result.states[:, 0] - driven,
@@ -395,14 +411,14 @@ def get_noise_variance(model: AxisModel, parameters: Array) -> Array:
 
 
 def _run_pass(
-    part: Timeline, axis_index: int, motion: LinearMotion, noise_variance: Array, start_std: Sequence[float]
+    part: Timeline, axis_indices: Counts, motion: LinearMotion, noise_variance: Array, start_std: Sequence[float]
 ) -> FilterPass:
-    """Run the filter over an axis of a part, for k parameter vectors."""
+    """Run the filter over a part, for k parameter vectors of the axes `axis_indices` (k,)."""
     lengths, index_of = part.spacings
     transitions, _, noise_covs = compute_transition(motion, lengths)
     gains, variances, covs = _compute_gains(transitions, noise_covs, index_of, noise_variance, start_std)
-    input_effects = _compute_input_effects(part, axis_index, motion)
-    positions_m = part.positions_m[:, axis_index]
+    input_effects = _compute_input_effects(part, axis_indices, motion)
+    positions_m = part.positions_m[:, axis_indices]
     upper = OUTLIER * np.sqrt(variances)
     lower = -upper
     state = np.zeros((*motion.b.shape, 1))
@@ -450,7 +466,7 @@ def _compute_gains(
     return gains, variances, covs
 
 
-def _compute_input_effects(part: Timeline, axis_index: int, motion: LinearMotion) -> Array:
+def _compute_input_effects(part: Timeline, axis_indices: Counts, motion: LinearMotion) -> Array:
     """Return the effect at each position of the inputs since the position before (m, k, n, 1)."""
     lengths, distances, index_of = part.segments
     distinct, input_index = np.unique(lengths, return_inverse=True)
@@ -459,16 +475,16 @@ def _compute_input_effects(part: Timeline, axis_index: int, motion: LinearMotion
     effects_at_positions = (compute_transition(motion, distinct).transition[distance_index] @ effects[..., None])[
         index_of
     ]
-    effects_at_positions *= part.inputs_mps2[:, axis_index, None, None, None]
+    effects_at_positions *= part.inputs_mps2[:, axis_indices, None, None]
     return np.add.reduceat(effects_at_positions, np.concatenate([[0], part.measured[:-1] + 1]), axis=0)
 
 
-def _compute_driven_states(part: Timeline, axis_index: int, motion: LinearMotion) -> Array:
+def _compute_driven_states(part: Timeline, axis_indices: Counts, motion: LinearMotion) -> Array:
     """Return the effect at each position of all inputs (m, k, n)."""
     lengths, index_of = part.spacings
     transitions, input_effects = (
         compute_transition(motion, lengths).transition,
-        _compute_input_effects(part, axis_index, motion),
+        _compute_input_effects(part, axis_indices, motion),
     )
     states = np.empty(input_effects.shape)
     state = states[0] = input_effects[0]
