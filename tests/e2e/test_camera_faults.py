@@ -24,7 +24,7 @@ KINDS = (
     ("heavy-3cm", 1),
     ("white-5cm", 22),
     ("average", 12),
-    ("first-order", 500),
+    ("first-order", 504),
 )
 SLOW_AND_NOISY = ("sim.camera.rate_hz=5.0", "sim.camera.noise_std_m=0.05", "duration_s=5.0")
 

@@ -47,7 +47,7 @@ def test_a_plan_beside_a_wall_of_a_room_has_the_least_weighted_cost(seed: int) -
     level = find_nearest_level(*rng.uniform(0.2, 0.9, size=2))
     target = plant.equilibrium((2.95, rng.choice([0.0, 2.45]), -1.2))
     x = target.copy()
-    x[list(plant.position_index)] -= rng.uniform(0.0, 0.1, size=3)
+    x[list(plant.position_index)] -= rng.uniform(0.0, 0.02, size=3)
     answer = solver.solve(0, x, target, Preview(level=level))
 
     weights = compute_stage_weights(get_link(level), steps)

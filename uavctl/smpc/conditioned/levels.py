@@ -8,7 +8,7 @@
    costs as much as the regulator, but near limits. With the regulator's cost V and V(x_t) + |z_t|² of a stage, the
    expected cost is V(x_0) + Σ_t s_t |z_t|². So a plan moves away from a limit in the stages of old information, and a
    plan that is soon replaced stays at its target. Plans of observed links use these weights beside limits, where the
-   regulator's mean keeps all limits: a new position frees a plan from back-offs, but not from other limits.
+   regulator's mean rests within the limits: a new position frees a plan from back-offs, but not from other limits.
 """
 
 from __future__ import annotations
