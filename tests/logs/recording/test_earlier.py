@@ -1,4 +1,4 @@
-"""Fields that records of earlier versions lack; tests/e2e/test_recordings_of_before.py has whole recordings."""
+"""Fields that records of earlier versions lack; tests/e2e/test_older_recordings.py has whole recordings."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Allocation:
     # Distance of the reference from each row (A, n, m), by the age and the number of rows that limit a target. It does
     # not fall with age, and the last one is that of a plan at rest
     reference_backoffs: Array
-    weights: Array  # weights (H,) of the stages in the cost of a plan
+    weights: Array | None = None  # weights (H,) of the stages in the cost of a plan; None: all alike
 
     @property
     def follows_age(self) -> bool:
@@ -175,7 +175,6 @@ class RiskLevels:
             compute_quantile(equal_budgets)[:, :, None],
             compute_quantile(DISTANT_SHARE * equal_budgets)[:, :, None],
             reference_backoffs,
-            np.ones(steps),
         )
 
     def _make_level(self, near: Allocation, risk: AgeRisk, motion: Allocation | None = None) -> RiskLevel:

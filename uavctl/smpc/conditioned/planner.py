@@ -177,7 +177,6 @@ class ConditionedSolver:
         # Margins of all rows minus their back-offs, and the view of the state rows (H, m)
         self._margins = np.full(width * steps + hard + 1, OPEN)
         self._margins_x = self._margins[: width * steps].reshape(steps, width)
-        self._equal_weights = np.ones(steps)
         self._used_margin = np.zeros((steps, width))  # margin of state rows that all parts use so far
         self._levels = RiskLevels(
             problem,
@@ -303,11 +302,15 @@ class ConditionedSolver:
             margin: Margin of the state rows for z = 0 (H, m).
             hard: Margin of the hard rows for z = 0.
         """
+        if allocation.weights is None:
+            for program in self._parts:
+                program.weigh_stages(None)
+            return
         least, used = margin.min(axis=0), REST_SHARE * row_backoffs.backoff.max(axis=0)
         is_resting = (least >= 0.0) & (margin[0] - least <= used)
         for program in self._parts:
             is_free = is_resting[program.columns].all() and (hard[program.hard] >= 0.0).all()
-            program.weigh_stages(allocation.weights if is_free else self._equal_weights)
+            program.weigh_stages(allocation.weights if is_free else None)
 
     def _find_rest(self, target: Array, preview: Preview) -> _Rest:
         """Find where a plan rests; that of the last target is kept, by its bits, without limits or a path."""

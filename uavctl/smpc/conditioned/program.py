@@ -149,21 +149,22 @@ class PartProgram:
         self._slews = range(len(rows_x) + pairs_u[0].size, len(rows_x) + self._width)  # those of the first stage
         self._rows, self._is_soft = rows, np.arange(len(rows)) < len(rows_x)
         self._slack_linear, self._slack_quadratic = problem.slack_linear, problem.slack_quadratic
-        # The program in y of each weights used so far, and z / y
+        # The program in y for each weights used so far, and z / y
         self._programs: dict[bytes, tuple[QuadraticProgram, Array]] = {}
-        self.weigh_stages(np.ones(steps))
+        self.weigh_stages(None)
         by_stage = rows_x.reshape(steps, -1, n), rows_u.reshape(steps, -1, n)
         is_suitable = WorkingSetGuess.is_suitable(*by_stage, len(d))
         self._guess_working_set = (
             WorkingSetGuess(*by_stage, self._program.sense).guess if is_suitable else self._guess_ramps
         )
 
-    def weigh_stages(self, weights: Array) -> None:
-        """Select the weights s (H,) of the stages for the programs to come."""
-        key = weights.tobytes()
+    def weigh_stages(self, weights: Array | None) -> None:
+        """Select the weights s (H,) of the stages for the programs to come; None: all alike."""
+        key = b"" if weights is None else weights.tobytes()
         if key not in self._programs:
             # y_t = s_t^½ z_t: min |y|²
-            scale = np.repeat(1.0 / np.sqrt(weights), self.part.inputs.size)
+            scale = np.ones(self._steps) if weights is None else 1.0 / np.sqrt(weights)
+            scale = np.repeat(scale, self.part.inputs.size)
             self._programs[key] = self._make_program(self._rows * scale), scale
         self._program, self._z_per_y = self._programs[key]
 
