@@ -42,14 +42,13 @@ north_m = [-2.0, 2.0]
   (in `uavctl/presets/`).
 * `--set key.path=value` overrides a key, as often as you like: `--set link.loss=0.3`,
   `--set 'link.blackout=[[20, 40]]'`. A string needs no quotes.
-* With `base`, missing keys come from there. `[room]` then replaces the lists of `[sets]`, `[target]` and
-  `[limits]`. `uavctl init` writes such a file.
-* Without `base`, a file needs `[plant]`, `[sets]` and `[cost]`.
+* `base` gives the missing keys. `[room]` replaces the lists of `[sets]`, `[target]` and `[limits]`. `uavctl init` writes
+  such a file. Without `base`, a file needs `[plant]`, `[sets]` and `[cost]`.
 * All problems are reported at once, with file, line, key and remedy (exit code 2).
 
 How to read the lists:
 
-* The value after a key is its default. Without one there is none, or brackets say how it follows.
+* The value after a key is its default.
 * (0.2…10) is the range; `>` and `<` exclude its end. Numbers without a range are -1e7 to 1e7.
 * The end of a key is its unit: `_s`, `_m`, `_deg`, `_ppm`, `_hz` (1/s), `_mps` (m/s), `_mps2` (m/s²), `_1ps` (1/s).
 * A span is `[from_s, to_s]` since the start. Vectors are local NED: north, east, down.
@@ -64,17 +63,15 @@ _DERIVED = {
     "plant.model": "`matrices` where `a` is given",
     "smpc.horizon": "48 with scheme `age-conditioned`",
     "target.position_m": "0, or the middle of the limits",
-    "limits.accel_mps2": "what the limits of the inputs allow",
+    "limits.accel_mps2": "by the limits of the inputs",
     "limits.slew_mps3": "15, more where an own plant's inputs are wider",
     "daemon.tick_s": "the longest up to 0.1 that divides Δt",
     "sim.camera.rate_hz": "one sample each Δt",
 }
 _CAMPAIGN = """# Keys of a campaign
 
-This page is generated from the types in `uavctl/lab/campaign` (`make docs`); do not edit it.
-
-A campaign is a TOML file. `docs/campaigns/` has complete ones; [campaigns](campaigns.md) runs and reads them. The
-shortest one:
+This page lists every key of a campaign. `make docs` generates it. `docs/campaigns/` has complete files;
+[campaigns](campaigns.md) runs them. The shortest one:
 
 ```toml
 name = "mine"

@@ -31,9 +31,7 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     disarm_s: Annotated[float, declare("time after which a landed vehicle is disarmed", "s", 0.1, 60)] = 5.0
     origin_deg_m: Annotated[
         Position,
-        declare(
-            "latitude, longitude [deg], altitude [m] of the origin for an ArduPilot without GPS; any place will do"
-        ),
+        declare("latitude, longitude [deg], altitude [m] of the origin of an ArduPilot without GPS; any place"),
     ] = (47.397742, 8.545594, 488.0)
 
 
@@ -163,13 +161,7 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
         tuple[str, ...], declare("permitted senders of UDP, as `10.0.0.0/24`; empty: any", length=1000)
     ] = ()
     max_datagrams_per_s: Annotated[
-        int,
-        declare(
-            "UDP datagrams a second of one sender, and of all strangers together; the vehicle has four times as many",
-            "1/s",
-            100,
-            1_000_000,
-        ),
+        int, declare("UDP datagrams a second of one sender; the vehicle has four times as many", "1/s", 100, 1_000_000)
     ] = 2000
     max_frames_per_s: Annotated[int, declare("frames a second, likewise", "1/s", 100, 1_000_000)] = 800
     max_bytes_per_s: Annotated[int, declare("bytes a second, likewise", "1/s", 10_000, 1_000_000_000)] = 200_000
@@ -252,9 +244,7 @@ class CheckConfig(Section, frozen=True, kw_only=True):
 
     seconds: Annotated[float, declare("listening time", "s", 0.001, 600)] = 8.0
     wait_s: Annotated[float, declare("further wait for a vehicle without a position", "s", 0, 600)] = 15.0
-    same_origin: Annotated[
-        bool, declare("the vehicle's own position has the cameras' origin after [frame]; else that of its start")
-    ] = True
+    same_origin: Annotated[bool, declare("the vehicle's own position has the cameras' origin, after [frame]")] = True
     offset_m: Annotated[
         float, declare("largest distance between the vehicle's own position and the cameras'", "m", 0.001, 1e6)
     ] = 0.5
@@ -262,7 +252,7 @@ class CheckConfig(Section, frozen=True, kw_only=True):
     yaw_deg: Annotated[
         float, declare("largest angle between the cameras' north and the vehicle's", "deg", 0.01, 45)
     ] = 10.0
-    margin_m: Annotated[float, declare("how far outside `sets` a flight may begin", "m", 0, 1000)] = 0.25
+    margin_m: Annotated[float, declare("distance outside `sets` at which a flight may begin", "m", 0, 1000)] = 0.25
     rehearsals: Annotated[int, declare("rehearsed flights, for the risk to leave the room", "", 0, MAX_REHEARSALS)] = 60
     battery_v: Annotated[float, declare("least voltage of the battery; 0: not tested", "V", 0, 1000)] = 0.0
     accept: Annotated[tuple[str, ...], declare("items that may fail", length=100)] = ()
@@ -275,7 +265,7 @@ class RelayConfig(Section, frozen=True, kw_only=True):
     message: Annotated[Literal["vision-position-estimate", "odometry"], declare("MAVLink message")] = (
         "vision-position-estimate"
     )
-    vehicle_time: Annotated[
-        bool, declare("stamp positions by the vehicle's clock if it asks for our time (PX4); else by ours")
-    ] = True
+    vehicle_time: Annotated[bool, declare("stamp positions by the vehicle's clock if it asks for our time (PX4)")] = (
+        True
+    )
     rate_hz: Annotated[float, declare("largest rate; the newest are sent", "1/s", 0.1, 1000)] = 50.0

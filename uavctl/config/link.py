@@ -47,8 +47,8 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     model: Annotated[
         Literal["bernoulli", "gilbert-elliott", "empirical", "trace"],
         declare(
-            "how packets are lost: `bernoulli` (each by itself), `gilbert-elliott` (in bursts, by a good and a bad "
-            "state), `empirical` (in measured runs) or `trace` (lost and late as measured)"
+            "losses: `bernoulli` (each by itself), `gilbert-elliott` (in bursts, by a good and a bad state), "
+            "`empirical` (in measured runs) or `trace` (losses and delays as measured)"
         ),
     ] = "bernoulli"
     probability: Annotated[
@@ -68,7 +68,7 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     trace_file: Annotated[
         str,
         declare(
-            "`trace`: CSV file beside this one with the delay [s] of each packet, nothing or `inf` if lost; of "
+            "`trace`: CSV file beside this one with the delay [s] of each packet, empty or `inf` if lost; of "
             "several columns `delay_s` (or `_ms`, `_us`, `_ns`)",
             length=MAX_PATH_LENGTH,
         ),

@@ -89,7 +89,8 @@ class PlantConfig(Section, frozen=True, kw_only=True):
     velocity_1ps: Annotated[Floats, declare("velocity gain of the vehicle", "1/s", length=3)] = ()
     integral_1ps2: Annotated[Floats, declare("integral gain of the vehicle", "1/s²", length=3)] = ()
     input_std_mps2: Annotated[
-        Floats, declare("standard deviation of reference changes that nobody sent, constant over Δt", "m/s²", length=3)
+        Floats,
+        declare("standard deviation of reference changes without a setpoint, constant over Δt", "m/s²", length=3),
     ] = ()
     force_drift_mps2_rts: Annotated[
         Floats,
@@ -139,8 +140,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
     controller: Annotated[
         str,
         declare(
-            "controller of another package (docs/extending.md): entry point of `uavctl.controllers` or "
-            "`module:Class`; the vehicle may rest where the scheme allows it",
+            "controller of another package (docs/extending.md): entry point of `uavctl.controllers` or `module:Class`",
             length=200,
         ),
     ] = ""
@@ -169,7 +169,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
 
 
 class ScheduleConfig(Section, frozen=True, kw_only=True):
-    """Information delays d_t: the age of the feedback that stage t counts on."""
+    """Information delays d_t: age of the feedback of stage t."""
 
     rule: Annotated[
         Literal["fixed", "search", "greedy"],
@@ -182,10 +182,7 @@ class ScheduleConfig(Section, frozen=True, kw_only=True):
     gamma_max: Annotated[float, declare("largest γ that `search` and `greedy` take", above=0, below=1)] = 0.985
     search_states: Annotated[Rows, declare("`search` minimises the mean cost over these states", length=200)] = ()
     joint: Annotated[
-        bool,
-        declare(
-            "γ by the exact probability that the feedback of all stages is usable; else by the product (6), as printed"
-        ),
+        bool, declare("γ by the joint probability that all feedback is usable; else by the product (6), as printed")
     ] = False
     late: Annotated[
         int,
@@ -220,7 +217,7 @@ class RiskConfig(Section, frozen=True, kw_only=True):
         ),
     ] = "observed"
     adapt: Annotated[
-        bool, declare("keep further from limits that are left too often; not with budgets `configured`")
+        bool, declare("keep further from limits that are broken too often; not with budgets `configured`")
     ] = True
 
 
@@ -256,8 +253,8 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     gate_sigma: Annotated[
         float,
         declare(
-            "standard deviations by which a position may miss the prediction, besides gate_m and the effect of "
-            "inputs; else it counts as lost, a repeated value as frozen",
+            "standard deviations by which a position may miss the prediction, besides gate_m; beyond them it counts "
+            "as lost",
             "",
             0.001,
             1e6,
@@ -267,8 +264,8 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     bias_drift: Annotated[
         float,
         declare(
-            "standard deviation that an unknown lasting acceleration (wind, hover thrust) gains in a second; it is "
-            "estimated and compensated; 0: none",
+            "standard deviation that an unknown lasting acceleration (wind, hover thrust) gains in a second; 0: it is "
+            "not estimated",
             "input units/√s",
             0,
             1000,
@@ -278,14 +275,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
         float, declare("part of each input that plans reserve to compensate it", "input units", 0, 1000)
     ] = 0.0
     bias_share: Annotated[
-        float,
-        declare(
-            "share of an input's half range that may compensate it, at least bias_max; beyond bias_max the setpoint "
-            "limiter cuts plans",
-            "",
-            0,
-            1,
-        ),
+        float, declare("share of an input's half range that may compensate it, at least bias_max", "", 0, 1)
     ] = 0.0
     inertial_std_mps2: Annotated[
         float,
@@ -308,10 +298,9 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
         declare("longest hold with neither a recent position nor a credible vehicle velocity", "s", 0, MAX_DURATION_S),
     ] = 0.5
     land: Annotated[bool, declare("then request the vehicle's landing mode (else hold)")] = True
-    recover_samples: Annotated[int, declare("fresh samples in a row before plans are flown again", "", 1, 1000)] = 3
+    recover_samples: Annotated[int, declare("new samples in a row before plans are flown again", "", 1, 1000)] = 3
     jump_s: Annotated[
-        float,
-        declare("impossible positions that agree for so long are a source that moved: brake, land", "s", 0.001, 60),
+        float, declare("time after which impossible positions that agree end the flight: brake, land", "s", 0.001, 60)
     ] = 1.2
 
 

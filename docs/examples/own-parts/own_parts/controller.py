@@ -1,4 +1,4 @@
-"""A regulator that keeps its speed within what braking before the limits allows."""
+"""A regulator that can always brake before the limits."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ class Careful:
         self.limits = np.array(problem.state_set.bounds)[:, list(problem.plant.velocity_index)]
 
     def plan(self, request: PlanRequest) -> np.ndarray:
-        """Inputs (H, n_u) of the steps to come: what is done now, and what in silence."""
+        """Inputs (H, n_u): the first for this step, the others for a silence."""
         plant, x, inputs = self.problem.plant, request.state, []
         acting = np.zeros(plant.n_u) if request.sent is None else request.sent
         for wanted, held in zip(request.states, request.inputs, strict=True):
