@@ -42,8 +42,8 @@ north_m = [-2.0, 2.0]
   (in `uavctl/presets/`).
 * `--set key.path=value` overrides a key, as often as you like: `--set link.loss=0.3`,
   `--set 'link.blackout=[[20, 40]]'`. A string needs no quotes.
-* `base` gives the missing keys. `[room]` replaces the lists of `[sets]`, `[target]` and `[limits]`. `uavctl init` writes
-  such a file. Without `base`, a file needs `[plant]`, `[sets]` and `[cost]`.
+* `base` gives the missing keys. `[room]` replaces the lists of `[sets]`, `[target]` and `[limits]`. Without `base`, a
+  file needs `[plant]`, `[sets]` and `[cost]`. `uavctl init` writes a file.
 * All problems are reported at once, with file, line, key and remedy (exit code 2).
 
 How to read the lists:
@@ -299,7 +299,7 @@ _STATES = {
     HandoverState.ENGAGED: "the controller flies",
     HandoverState.FAILSAFE: "a failsafe of the vehicle flies; nothing is sent",
     HandoverState.UNCLEAR: "another mode for an unknown reason; nothing is sent",
-    HandoverState.TAKEN_OVER: "somebody else flies; nothing is sent without an order",
+    HandoverState.TAKEN_OVER: "another pilot flies; nothing is sent without an order",
     HandoverState.LANDING: "landing is requested",
     HandoverState.SETTLING: "the vehicle lands by itself",
     HandoverState.DONE: "disarmed",
@@ -320,7 +320,7 @@ _EVENTS = {
     "([operation](operation.md#after-the-pilots-switch))",
     HandoverEvent.DISARMED: "disarmed",
     HandoverEvent.FAILSAFE: "a [failsafe of the vehicle](#failsafes-of-the-vehicle) acts",
-    HandoverEvent.UNCLEAR: "another mode, and nothing shows who chose it",
+    HandoverEvent.UNCLEAR: "another mode for an unknown reason",
     HandoverEvent.OTHER: "a person flies; or a failsafe on a flight that the pilot began",
     HandoverEvent.EXTERNAL: "armed, in OFFBOARD or GUIDED",
     HandoverEvent.PENDING: "the request has not taken effect yet",
@@ -366,9 +366,9 @@ Evidence: system status CRITICAL, "failsafe" or "fence breached" in a text, FENC
 the mode must be one that failsafes choose ({_modes(ModeChoice.EITHER)}), or one that nothing else chooses
 ({_modes(ModeChoice.FAILSAFE)}).
 
-A flight that the pilot began releases the vehicle. A flight with `--arm`:
+A flight that the pilot began releases the vehicle. A flight with `--arm` reacts:
 
-* The failsafe ends in the climb: PX4 continues its climb, and so does the hand-over, within `climb_s`.
+* The failsafe ends in the climb: continue the climb, within `climb_s`.
 * The failsafe lands: wait for `land_s`.
 * It hovers, or has ended an engaged flight: request landing after `climb_s`, unless `uavctl ctl engage` comes first.
 
@@ -384,16 +384,15 @@ In each case nothing is sent. The pilot's switch counts once a heartbeat shows i
 
 * A request for the external mode or for landing is repeated only right after a heartbeat, so that a switch shows
   first.
-* The first request at the end of a climb, and that for landing, do not wait. A pilot who switches in that second
+* The first request at the end of a climb, and that for landing, do not wait. After a switch in that second the pilot
   must switch again.
 * A COMMAND_ACK counts before the next heartbeat. A heartbeat that still shows another mode 0.3 s later is the
   pilot's switch.
 
 ## Landing
 
-Once the vehicle shows that it lands, another mode is the pilot's; the mode of before counts so only after 2 s. A
-vehicle that we took off is asked to land while it is heard armed, also without heartbeats, up to ten times `land_s`.
-The end of `land_s` is reported.
+Once the vehicle shows that it lands, another mode is the pilot's (the previous mode only after 2 s). A vehicle that we
+took off is asked to land while it is heard armed, up to ten times `land_s`.
 """
 
 
