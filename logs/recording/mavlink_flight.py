@@ -522,18 +522,18 @@ def list_facts(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     yield "modes", ", ".join(dict.fromkeys(mode.mode for mode in info.modes)) or "none"
     yield "texts", str(len(info.texts))
     if info.battery_v is not None:
-        yield "battery", "{:.2f} V at the begin, {:.2f} V at the end".format(*info.battery_v)
+        yield "battery", "{:.2f} V at the start, {:.2f} V at the end".format(*info.battery_v)
     for sender in info.senders:
         kind, lost = (
             f" ({sender.kind})" if sender.kind else "",
             f"; {sender.missing} more did not come" if sender.missing else "",
         )
         yield f"from {sender.system}, component {sender.component}{kind}", f"{count(sender.messages, 'message')}{lost}"
-    yield "parameters told", str(len(info.parameters))
+    yield "parameters sent", str(len(info.parameters))
     if info.bad:
         yield "passed over", ", ".join(f"{number} {reason}" for reason, number in info.bad.items())
     if info.missing:
-        yield "not in it", ", ".join(info.missing)
+        yield "missing", ", ".join(info.missing)
 
 
 def format_rate(info: MavlinkFlightInfo, message: str) -> str:

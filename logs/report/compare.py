@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -106,7 +106,8 @@ class Figure(msgspec.Struct, frozen=True, kw_only=True):
 
 def collect_figures(recordings: Sequence[LoadedFlight]) -> Iterator[Figure]:
     """Return the figures that at least one of the flights has."""
-    measured = [{row[0]: row for row in _collect_rows(recording)} for recording in recordings]
+    methods = dict.fromkeys(name for recording in recordings for name in recording.summary.methods)
+    measured = [{row[0]: row for row in _collect_rows(recording, methods)} for recording in recordings]
     for key, (_, group, text, unit, _) in {
         key: row for figures in reversed(measured) for key, row in figures.items()
     }.items():
@@ -128,13 +129,12 @@ def collect_figures(recordings: Sequence[LoadedFlight]) -> Iterator[Figure]:
 _Row = tuple[str, str, str, str, Value]  # key, group, text, unit and value
 
 
-def _collect_rows(recording: LoadedFlight) -> tuple[_Row, ...]:
-    """Return the figures of one flight; those of the summary keep its keys."""
+def _collect_rows(recording: LoadedFlight, methods: Iterable[str]) -> tuple[_Row, ...]:
+    """Return the figures of one flight, with the plans of each method; those of the summary keep its keys."""
     s, flight = recording.summary, recording.flight
     ages = [d.age_steps for d in flight.steps.decisions if d.age_steps is not None]
     error_m = compute_position_errors_m(flight)
     inputs = np.linalg.norm(flight.steps.input, axis=1)
-    methods = {**dict.fromkeys(("frozen", "mixture", "exact"), 0), **s.methods}
     in_fallback_s = sum((b - a for a, b in flight.fallback_spans), 0.0)
     return (
         ("steps", "flight", "steps flown", "", s.steps),
@@ -159,7 +159,7 @@ def _collect_rows(recording: LoadedFlight) -> tuple[_Row, ...]:
         ("mean_input", "tracking", "input, rms", flight.design.input_unit, _compute_rms(inputs)),
         ("solves", "plans", "solves", "", s.solves),
         ("failed_solves", "plans", "solves without optimum", "", s.failed_solves),
-        *((f"methods.{name}", "plans", f"plans, {name}", "", count) for name, count in methods.items()),
+        *((f"methods.{name}", "plans", f"plans, {name}", "", s.methods.get(name, 0)) for name in methods),
         ("largest_gap", "plans", "largest certified gap", "", s.largest_gap),
         *_collect_percentiles("decision_us", "decision time", s.decision_us),
         *_collect_percentiles("tick_lateness_us", "tick lateness", s.tick_lateness_us),

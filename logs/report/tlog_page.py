@@ -228,7 +228,7 @@ SECTIONS: tuple[PageSection[MavlinkFlight], ...] = (
         "Axes over time",
         _draw_axes,
         when=_has_place,
-        note="Time counts from the begin of the recording. Positions are in local NED; height is positive upwards.",
+        note="Time counts from the start of the recording. Positions are in local NED; height is positive upwards.",
         legend=(*_MARKS, _SETPOINT),
     ),
     PageSection(

@@ -32,7 +32,7 @@ _PROMPT_TOLERANCE_SHARE = 0.6  # of the way that a person was asked to move the 
 _CONSTANT_POSITION = 128  # it assumes a constant position; PX4 sets this flag for every vehicle at rest
 _PX4 = 12  # MAV_AUTOPILOT
 _WANT = "the same axes, unit and handedness as the vehicle's own"
-_MOVE = "move the body by half a metre up, north and east while it looks, or `uavctl check --move`"
+_MOVE = "move the body by half a metre up, north and east while the check listens, or use `uavctl check --move`"
 
 
 def check_axes(data: CheckData, config: Config, prompted_moves: list[tuple[Vec3, Vec3]]) -> list[Item]:

@@ -300,8 +300,9 @@ def _make_climb_rule(config: Config, take_off_m: float | None) -> Rule:
     bounds = [f"at most {ceiling_m:g} m, the room (sets)"] if math.isfinite(ceiling_m) else []
     bounds += [f"at least {min_m:g} m, --takeoff"] if min_m else []
     hint = (
-        "Set it to the height of --takeoff. PX4 climbs to it by itself. Lower, the flight begins below --takeoff (not "
-        "at all under a third of it). Higher than the room, the ceiling ends the climb if OFFBOARD is not granted."
+        "Set it to the height of --takeoff. PX4 climbs to it by itself. With a lower value the flight begins below "
+        "--takeoff; below a third of it, not at all. With a value above the room, the ceiling ends the climb if "
+        "OFFBOARD is refused."
     )
 
     def judge(value: float, _get: ParameterGetter, _config: Config) -> ParameterVerdict:

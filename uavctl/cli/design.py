@@ -188,7 +188,7 @@ def make_design_document(design: Design, wall_s: float) -> dict[str, object]:
 
 def render_design(design: Design, name: str) -> RenderableType:
     """Return Assumption 4 and the schedule as tables."""
-    headings = ("item", "holds", "value", "limit", "of what")
+    headings = ("item", "holds", "value", "limit", "quantity")
     rows = (
         (
             check.item,

@@ -33,8 +33,8 @@ def make_replay_table(replayed: ReplayOutcome) -> RenderableType:
         return make_pair_table("Replay", rows)
     rows += _describe_difference("first difference", first)
     if first.stage:
-        rows.append(("in question", first.stage))
-    rows += [("made otherwise", text) for text in replayed.other_versions]
+        rows.append(("possible cause", first.stage))
+    rows += [("other version", text) for text in replayed.other_versions]
     if result.context is not None:
         rows += _describe_context(result.context)
     decision = result.first_decision
@@ -42,9 +42,9 @@ def make_replay_table(replayed: ReplayOutcome) -> RenderableType:
         rows.append(("decisions that differ", "none"))
     else:
         decisions_since = result.decisions - (0 if result.context is None else result.context.decisions_before)
-        rows.append(("decisions that differ", f"{result.decisions_differing} of {decisions_since} from then on"))
+        rows.append(("decisions that differ", f"{result.decisions_differing} of {decisions_since}, from then on"))
         if decision != first:
-            rows += _describe_difference("the first of them", decision)
+            rows += _describe_difference("first such decision", decision)
     return Group(make_pair_table("Replay", rows), _make_course_table(result.course))
 
 
@@ -76,12 +76,12 @@ def _describe_context(context: Context) -> Iterator[tuple[str, object]]:
         *([f"{context.missed_ticks} ticks missed before it"] if context.missed_ticks else []),
         *(["the hand-over is asked for"] if context.stop else []),
     ]
-    yield "that tick was given", "; ".join(inputs)
+    yield "inputs of that tick", "; ".join(inputs)
     if context.recorded is not None and context.recorded == context.replayed:
-        yield "and decided, both", _describe_choice(context.recorded)
+        yield "decision, both", _describe_choice(context.recorded)
         return
-    yield "and decided, recorded", _describe_choice(context.recorded)
-    yield "and decided, replayed", _describe_choice(context.replayed)
+    yield "decision, recorded", _describe_choice(context.recorded)
+    yield "decision, replayed", _describe_choice(context.replayed)
 
 
 def _describe_choice(choice: Chosen | None) -> str:
@@ -95,7 +95,7 @@ def _describe_choice(choice: Chosen | None) -> str:
 
 def _make_course_table(course: tuple[FieldDivergence, ...]) -> Table:
     """Return a table of the differences in each field, on the recorded inputs."""
-    title = "What becomes of it, on the recorded inputs"
+    title = "Differences by field, on the recorded inputs"
     if len(course) > MAX_FIELDS:
         title += f" ({MAX_FIELDS} of {len(course)} fields, all with --json)"
     table = make_table(title, ("field", "from [s]", "records that differ", "largest", "at [s]"), ())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,14 @@ from report_rig import omit_figures, walk_html
 from rich.console import Console
 
 from logs.recording.flight import FlightData
+from logs.recording.reader import read_kind
 from logs.recording.recorder import SyncRecorder
 from logs.recording.summary import summarise
 from logs.report.compare import Figure, FlightComparison, compare_flights, load_flights
 from logs.report.compare_page import ComparisonView, render_comparison
 from uavctl.cli.app import run
 from uavctl.cli.log_report import render_terminal_comparison
-from uavctl.records import Datagram, Decision, Header, Record, Timing
+from uavctl.records import Datagram, Decision, Header, Plan, Record, Timing
 
 SECONDS = 6.0
 EXACT = "solver.method=exact"
@@ -49,6 +51,11 @@ def record(path: Path, entries: Sequence[tuple[str, int, Record]]) -> Path:
     return path
 
 
+def count_methods(path: Path) -> dict[str, int]:
+    """Plans of a recording by their method, as recorded."""
+    return dict(Counter(plan.method for plan in read_kind(path, Plan)))
+
+
 def figures(comparison: FlightComparison) -> dict[str, Figure]:
     return {figure.key: figure for figure in comparison.figures}
 
@@ -69,6 +76,21 @@ def test_the_same_flight_says_so(base: MemorySink, tmp_path: Path) -> None:
     assert likeness.records == len(base.entries) - 1  # all but the header
     assert comparison.parameters == () and comparison.notes[1:] == ()
     assert all(figure.differences == (0,) for figure in comparison.figures if figure.group not in ("time", "recording"))
+
+
+def test_plans_are_counted_by_the_methods_that_any_flight_used(base: MemorySink, tmp_path: Path) -> None:
+    other = lockstep("room", 2.0)
+    a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
+    counts = {
+        key: figure.values
+        for key, figure in figures(compare_flights(load_flights([a, b]))).items()
+        if key.startswith("methods.")
+    }
+    assert all(None not in values and any(values) for values in counts.values())
+    assert {key: value for key, (value, _) in counts.items() if value} == {
+        f"methods.{name}": count for name, count in count_methods(a).items()
+    }
+    assert counts["methods.age-conditioned"] == (0, sum(count_methods(b).values()))
 
 
 def test_parameters_that_differ_have_dotted_names(base: MemorySink, other: MemorySink, tmp_path: Path) -> None:
