@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from uavctl.arrays import Array
 from uavctl.lab.campaign.tasks import Cell, make_tasks
-from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, allocate_by_age, compute_quantile, compute_reference_backoffs
+from uavctl.smpc.conditioned.backoffs import SLACK_SHARE, RestingRows, allocate_by_age, compute_quantile
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.estimate import innovation_form
@@ -41,7 +41,7 @@ def distances(
     deviations = np.sqrt([EAST[0] @ item @ EAST[0] for item in propagate_covariance(case.plant, steps)[1:]])
     risk = allocate_by_age(link, deviations, ALLOWED, n_binding=2)
     slew = SlewRows(case.plant, case.input_set, slew_mps3)
-    return compute_reference_backoffs(case, risk, ALLOWED, slew, EAST, cov, most, bounds_slack=bounds_slack)
+    return RestingRows(case, slew, EAST, cov).find_distances(risk, ALLOWED, most, bounds_slack=bounds_slack)
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.6, 0.9])
@@ -126,9 +126,8 @@ def test_late_positions_are_counted_from_their_capture() -> None:
             return self._on_time.outage(age - 1) if age else 1.0
 
     risk = allocate_by_age(Late(), sigma(case.horizon, np.zeros((4, 4))), ALLOWED, n_binding=2)
-    late = compute_reference_backoffs(case, risk, ALLOWED, SlewRows(case.plant, case.input_set, np.inf), EAST, None, 1)[
-        0, 0
-    ]
+    rows = RestingRows(case, SlewRows(case.plant, case.input_set, np.inf), EAST, None)
+    late = rows.find_distances(risk, ALLOWED, 1)[0, 0]
     on_time = distances(bernoulli(np.array([0.7])), case.horizon)[0, 0]
     assert on_time + 0.5 < late < on_time + 3.0
 

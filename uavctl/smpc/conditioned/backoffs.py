@@ -10,7 +10,7 @@ The margin of a row is b - c'x: what its limit leaves. The back-off β is the ma
 
        σ² = c'(A^t P A^t' + Σ_{j<t} A^j E W E' A^j')c,   t = 1 … H
 
-4. `compute_reference_backoffs`: plans keep their back-offs as rows of the program. The reference decides how often a
+4. `RestingRows`: plans keep their back-offs as rows of the program. The reference decides how often a
    new position leaves a plan that cannot keep them. It keeps one distance from a limit, or the larger of two:
    - with the first, a plan at rest at all ages is outside no more often than allowed;
    - with the second, for back-offs that no loop corrects, at most a share of new plans needs slack, by a model of their
@@ -164,8 +164,8 @@ def compute_quantile(risk: Array) -> Array:
     return np.asarray(-ndtri(np.minimum(risk, MAX_RISK)))
 
 
-def compute_violation_risk(margin: Array, sigma: Array) -> Array:
-    """Return the probability Φ(-margin / σ) that a row is violated whose mean keeps `margin`; all of the same shape."""
+def compute_violation_risk(margin: Array | float, sigma: Array) -> Array:
+    """Return the probability Φ(-margin / σ) that a row is violated whose mean keeps `margin`, of the shape of σ."""
     if np.count_nonzero(sigma) == sigma.size:
         return np.asarray(ndtr(margin / -sigma))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -338,68 +338,99 @@ def _make_part_maps(
 SLACK_SHARE = 0.7  # share of new plans beside a limit that may need slack, as a share of 1 - δ_x
 
 
-def compute_reference_backoffs(
-    problem: ControlProblem,
-    risk: AgeRisk,
-    allowed: float,
-    slew: SlewRows,
-    c: Array,
-    cov: Array | None,
-    max_shares: int,
-    filter_plant: Plant | None = None,
-    *,
-    bounds_slack: bool = True,
-) -> Array:
-    """Return the distances (max_shares, m) of plans at rest from rows `c` (m, n_x), for 1 … `max_shares` sharing rows.
+class RestingRows:
+    """Rows of plans at rest, whose predictions plans of any link and any budgets share.
 
     Args:
-        risk: Budgets of the ages.
-        allowed: 1 - δ_x.
         slew: Largest change of setpoints in a step.
+        c: Rows (m, n_x).
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states, the plant's before biases of its inputs; None: `problem.plant`.
             A new estimate of a bias changes no plan, because inputs include the bias.
-        bounds_slack: Whether new plans may seldom need slack. At a wall that costs 3 % with 30 % losses and 8 % with
-            60 %; what slack adds to the risk is found by the loop on the observed risk.
     """
-    rows = _make_reference_rows(problem, risk, slew, c, cov, problem.plant if filter_plant is None else filter_plant)
-    distances = np.zeros((max_shares, len(c)))
-    for share in range(1, max_shares + 1):
-        for row in range(len(c)):
-            distances[share - 1, row] = rows.find_distance(row, share, allowed, bounds_slack=bounds_slack)
-    return distances
+
+    def __init__(
+        self, problem: ControlProblem, slew: SlewRows, c: Array, cov: Array | None, filter_plant: Plant | None = None
+    ) -> None:
+        self._problem, self._c, self._cov = problem, c, cov
+        self._filter_plant = problem.plant if filter_plant is None else filter_plant
+        self._c_powers = c @ _compute_powers(problem.plant.a, problem.horizon)  # (H+1, m, n_x)
+        self._reach = _compute_reach(problem, slew, self._c_powers[:-1])
+        self._predictions: dict[int, tuple[Array, Array]] = {}  # of each age that was asked for
+
+    def find_distances(self, risk: AgeRisk, allowed: float, max_shares: int, *, bounds_slack: bool = True) -> Array:
+        """Return the distances (max_shares, m) of plans at rest, for 1 … `max_shares` sharing rows.
+
+        Args:
+            risk: Budgets of the ages.
+            allowed: 1 - δ_x.
+            bounds_slack: Whether new plans may seldom need slack. At a wall that costs 3 % with 30 % losses and 8 %
+                with 60 %; what slack adds to the risk is found by the loop on the observed risk.
+        """
+        age = int(risk.age_probabilities.argmax())
+        # Share of plans that are still flown at each age, and q_t of those that end there
+        flown_share = np.minimum.accumulate(risk.age_probabilities[age:] / risk.age_probabilities[age])
+        gaps = flown_share - np.append(flown_share[1:], 0.0)
+        sigma, correction = self._predict(age)
+        distances = np.zeros((max_shares, len(self._c)))
+        of_row: dict[bytes, Array] = {}  # alike rows have the same distances
+        for i in range(len(self._c)):
+            row = _RestingRow(risk, age, gaps, sigma[:, i], self._reach[:, i], correction[:, :, i])
+            if row.key not in of_row:
+                shares = range(1, max_shares + 1)
+                of_row[row.key] = np.array([row.find_distance(n, allowed, bounds_slack=bounds_slack) for n in shares])
+            distances[:, i] = of_row[row.key]
+        return distances
+
+    def _predict(self, age: int) -> tuple[Array, Array]:
+        """Return the deviations of the rows (H, m), and of the effect c'A^s e of a new position on them (L, H, m).
+
+        Args:
+            age: Age of most positions when they arrive [steps]; L is H less this age.
+        """
+        if age not in self._predictions:
+            c, steps, n_x = self._c, self._problem.horizon, self._problem.plant.n_x
+            step_covs = propagate_covariance(self._filter_plant, age + steps, self._cov)[age:, :n_x, :n_x]
+            # S_t = Σ_t - Σ_0,  var(c'A^s e) = c'A^s S_t A^s'c
+            correction_cov = step_covs[1 : steps - age + 1] - step_covs[0]
+            variance = np.einsum("smi,tij,smj->tsm", self._c_powers[1:], correction_cov, self._c_powers[1:])
+            deviations = np.sqrt(np.maximum(np.einsum("mi,tij,mj->tm", c, step_covs[1:], c), 0.0))
+            self._predictions[age] = deviations, np.sqrt(np.maximum(variance, 0.0))
+        return self._predictions[age]
 
 
 @dataclass(frozen=True, eq=False)
-class _RestingRows:
-    """Rows of plans at rest, with stages s = 1 … H of a new plan and t = 1 … L of the previous one."""
+class _RestingRow:
+    """One row, with stages s = 1 … H of a new plan and t = 1 … L of the previous one."""
 
     risk: AgeRisk  # budgets of the ages
     age: int  # age of most positions when they arrive [steps]
     gaps: Array  # q_t (L,)
-    sigma: Array  # deviations of the rows (H, m) in the stages of a plan
-    reach: Array  # g_s, distance from the limit that inputs can gain (H, m)
-    correction: Array  # deviations of c'A^s e (L, H, m), the effect of a new position on the rows
+    sigma: Array  # deviations of the row (H,) in the stages of a plan
+    reach: Array  # g_s, distance from the limit that inputs can gain (H,)
+    correction: Array  # deviations of c'A^s e (L, H), the effect of a new position on the row
 
-    def find_distance(self, row: int, n_rows: int, allowed: float, *, bounds_slack: bool) -> float:
-        """Return the distance to keep from a row that shares the risk with `n_rows` - 1 others."""
-        weights, sigma = self.risk.age_probabilities[self.age :], self.sigma[: self.gaps.size, row]
+    @property
+    def key(self) -> bytes:
+        """All that distinguishes the row from others of the same budgets."""
+        return self.sigma.tobytes() + self.reach.tobytes() + self.correction.tobytes()
+
+    def find_distance(self, n_rows: int, allowed: float, *, bounds_slack: bool) -> float:
+        """Return the distance to keep from the row where it shares the risk with `n_rows` - 1 others."""
+        weights, sigma = self.risk.age_probabilities[self.age :], self.sigma[: self.gaps.size]
         ages = np.minimum(self.age + np.arange(len(self.sigma)), len(self.risk.budgets) - 1)
-        backoff = compute_quantile(self.risk.row_budgets[ages] / n_rows) * self.sigma[:, row]
-        earlier_backoff, corrections = backoff[: self.gaps.size, None], self.correction[:, :, row]
+        backoff = compute_quantile(self.risk.row_budgets[ages] / n_rows) * self.sigma
+        earlier_backoff = backoff[: self.gaps.size, None]
 
         def find_outside_excess(d: float) -> float:
             # Σ_t π_t Φ(-d / σ_t) - (1 - δ_x - P(a > H)) / n
-            return (
-                float(weights @ compute_violation_risk(np.full_like(sigma, d), sigma))
-                - (allowed - self.risk.older_probability) / n_rows
-            )
+            return float(weights @ compute_violation_risk(d, sigma)) - (allowed - self.risk.older_probability) / n_rows
 
         def find_slack_excess(d: float) -> float:
             # Σ_t q_t max_s Φ(-(max(d, β_t) - β_s + g_s) / σ_ts) - 0.7 (1 - δ_x) / n
-            margin = np.maximum(d, earlier_backoff) - backoff + self.reach[:, row]
+            margin = np.maximum(d, earlier_backoff) - backoff + self.reach
             return (
-                float(self.gaps @ compute_violation_risk(margin, corrections).max(axis=1))
+                float(self.gaps @ compute_violation_risk(margin, self.correction).max(axis=1))
                 - SLACK_SHARE * allowed / n_rows
             )
 
@@ -408,30 +439,11 @@ class _RestingRows:
         distance = 0.0
         for find_excess in (find_outside_excess, find_slack_excess)[: 1 + bounds_slack]:
             if find_excess(distance) > 0.0:
-                upper = distance + float(max(self.sigma[:, row].max(), backoff.max(), corrections.max()))
+                upper = distance + float(max(self.sigma.max(), backoff.max(), self.correction.max()))
                 while find_excess(upper) > 0.0:
                     upper *= 2.0
                 distance = float(brentq(find_excess, distance, upper))
         return distance
-
-
-def _make_reference_rows(
-    problem: ControlProblem, risk: AgeRisk, slew: SlewRows, c: Array, cov: Array | None, filter_plant: Plant
-) -> _RestingRows:
-    plant, steps = problem.plant, problem.horizon
-    age = int(risk.age_probabilities.argmax())
-    step_covs = propagate_covariance(filter_plant, age + steps, cov)[age:, : plant.n_x, : plant.n_x]
-    # Share of plans that are still flown at each age, and q_t of those that end there
-    flown_share = np.minimum.accumulate(risk.age_probabilities[age:] / risk.age_probabilities[age])
-    gaps = flown_share - np.append(flown_share[1:], 0.0)
-    # S_t = Σ_t - Σ_0,  var(c'A^s e) = c'A^s S_t A^s'c
-    correction_cov = step_covs[1 : gaps.size + 1] - step_covs[0]
-    c_powers = c @ _compute_powers(plant.a, steps)  # (H+1, m, n_x)
-    variance = np.einsum("smi,tij,smj->tsm", c_powers[1:], correction_cov, c_powers[1:])
-    deviations = np.sqrt(np.maximum(np.einsum("mi,tij,mj->tm", c, step_covs[1:], c), 0.0))
-    return _RestingRows(
-        risk, age, gaps, deviations, _compute_reach(problem, slew, c_powers[:-1]), np.sqrt(np.maximum(variance, 0.0))
-    )
 
 
 def _compute_powers(matrix: Array, max_power: int) -> Array:

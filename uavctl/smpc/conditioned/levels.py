@@ -25,11 +25,11 @@ from uavctl.smpc.conditioned.backoffs import (
     DISTANT_SHARE,
     AgeRisk,
     Index,
+    RestingRows,
     RowDeviations,
     allocate_by_age,
     allocate_equally,
     compute_quantile,
-    compute_reference_backoffs,
     find_opposite_rows,
 )
 from uavctl.smpc.conditioned.program import SlewRows
@@ -121,9 +121,11 @@ class RiskLevels:
         bounds_slack: bool,
     ) -> None:
         self._problem, self._law, self._parts, self._equilibria = problem, law, parts, equilibria
-        self._rows, self._reference_rows, self._deviations, self._slew = rows, reference_rows, deviations, slew
-        self._allowed, self._cov, self._filter_plant = allowed, cov, filter_plant
+        self._rows, self._reference_rows, self._deviations = rows, reference_rows, deviations
+        self._allowed = allowed
         self._c, self._b = problem.state_set.c[rows], problem.state_set.b[rows]
+        self._exact_sigma = deviations.compute(None)  # deviations (H, m) from an exact state
+        self._resting = RestingRows(problem, slew, self._c[reference_rows], cov, filter_plant)
         steps, n_x, n_parts = problem.horizon, problem.plant.n_x, len(parts)
         near = self._make_bounded(
             allocate_by_age(link, self._select_position_deviations(), allowed, exponent, n_parts),
@@ -150,16 +152,8 @@ class RiskLevels:
     def _make_bounded(self, risk: AgeRisk, *, bounds_slack: bool) -> Allocation:
         """Make an allocation whose rows have back-offs, and one distance of the reference at all ages."""
         reference_backoffs = np.zeros((1, len(self._parts), self._rows.size))
-        reference_backoffs[0][:, self._reference_rows] = compute_reference_backoffs(
-            self._problem,
-            risk,
-            self._allowed,
-            self._slew,
-            self._c[self._reference_rows],
-            self._cov,
-            len(self._parts),
-            self._filter_plant,
-            bounds_slack=bounds_slack,
+        reference_backoffs[0][:, self._reference_rows] = self._resting.find_distances(
+            risk, self._allowed, len(self._parts), bounds_slack=bounds_slack
         )
         return self._make_allocation(risk, reference_backoffs)
 
@@ -167,13 +161,13 @@ class RiskLevels:
         steps = self._problem.horizon
         # Row a, column t - 1: index of the budget of stage t of a plan from a position of age a
         ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-        budgets = risk.row_budgets[ages]
+        budgets = risk.row_budgets
         equal_budgets = budgets / max(1, self._rows.size)
         return Allocation(
             risk,
-            budgets,
-            compute_quantile(equal_budgets)[:, :, None],
-            compute_quantile(DISTANT_SHARE * equal_budgets)[:, :, None],
+            budgets[ages],
+            compute_quantile(equal_budgets)[ages][:, :, None],
+            compute_quantile(DISTANT_SHARE * equal_budgets)[ages][:, :, None],
             reference_backoffs,
         )
 
@@ -186,7 +180,7 @@ class RiskLevels:
         """
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(risk.budgets < 1.0))
-        oldest = self._deviations.compute(None)[max(0, counts - 1)]
+        oldest = self._exact_sigma[max(0, counts - 1)]
         share = np.array(self._allowed / len(self._parts))
         distance = np.maximum(self.transit.reference_backoffs[-1, -1], near.reference_backoffs[-1, -1])
         far = np.maximum(distance, float(compute_quantile(share)) * oldest)
@@ -261,7 +255,7 @@ class RiskLevels:
 
     def _select_position_deviations(self) -> Array:
         """Return the deviations (H,) for the allocation to the ages: those of the position with the largest one."""
-        sigma, index = self._deviations.compute(None), list(self._problem.plant.position_index)
+        sigma, index = self._exact_sigma, list(self._problem.plant.position_index)
         rows = np.any(self._c[:, index] != 0.0, axis=1)
         limited = sigma[:, rows] if rows.any() else sigma
         return np.asarray(limited[:, limited[-1].argmax()] if limited.size else np.zeros(len(sigma)))

@@ -111,7 +111,7 @@ class _PlanResult(msgspec.Struct, frozen=True, eq=False):
 class ConditionedSolver:
     """Answers from one strictly convex program for each independent part.
 
-    The reference is the equilibrium nearest to the target at which a plan may rest, see `compute_reference_backoffs`.
+    The reference is the equilibrium nearest to the target at which a plan may rest, see `RestingRows`.
     An answer depends on its question alone, bit for bit. Not for concurrent use.
 
     Args:
@@ -121,7 +121,7 @@ class ConditionedSolver:
         cov: Covariance (n, n) of the estimate's error after a position, where none is lost; None: it is exact.
         filter_plant: Plant of the filter, of n states: the plant's, then biases of its inputs; None: `problem.plant`.
         has_observed_levels: Whether there are the certificate and the levels of observed links.
-        bounds_slack: Whether new plans beside a limit may seldom need slack, see `compute_reference_backoffs`.
+        bounds_slack: Whether new plans beside a limit may seldom need slack, see `RestingRows`.
 
     Raises:
         DesignError: The plant has no regulator, a state is reached by no input, or information is older than the
