@@ -142,6 +142,7 @@ def fly_daemon(
             design = build_flight_design(config)
             check_places(config, design, take_off_m, orders.goal)
             prepared = prepare(config, design)
+        prepared.make_levels()
         # Loaded late: it takes an eighth of the loading time of `fly`.
         from uavctl.cli.check import check_before_arming, make_mission_items, record_items, record_parameters
 

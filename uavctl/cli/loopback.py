@@ -163,6 +163,7 @@ def fly_lockstep(prepared: Prepared, path: Path, orders: FlightOrders) -> Flight
 def _fly_real_time(prepared: Prepared, path: Path, orders: FlightOrders, viewers: DerivedTopics) -> FlightSummary:
     config, takes_off = prepared.config, orders.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
+    prepared.make_levels()
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
         connections = stack.enter_context(open_links(config))

@@ -457,6 +457,11 @@ class Prepared:
     design: AnyDesign
     controller: Controller
 
+    def make_levels(self) -> None:
+        """Make all levels of the budgets: for real time, where a tick that makes one takes up to 50 ms longer."""
+        if isinstance(self.design, ConditionedDesign) and self.config.risk.budgets == "observed":
+            self.design.solver.make_levels()
+
 
 def prepare(config: Config, design: AnyDesign) -> Prepared:
     """Make the controller of a design.

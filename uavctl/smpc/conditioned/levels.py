@@ -201,6 +201,12 @@ class RiskLevels:
             found = self._levels[level] = self._make_level(near, near.risk, motion)
         return found
 
+    def make_all(self) -> None:
+        """Make the levels of all observed links now; `get` then makes none, and returns the same ones."""
+        if self._free is not None:
+            for level in range(CERTIFICATE_LEVEL + 1, LAST_LEVEL + 1):
+                self.get(level)
+
     def _make_observed(self, link: AgeModel) -> Allocation:
         """Make the allocation whose rows keep the budgets of a link; the certificate's if it has none."""
         try:

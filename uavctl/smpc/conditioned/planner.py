@@ -225,6 +225,10 @@ class ConditionedSolver:
         sides[self._rows] -= self._levels.get(CONFIGURED_LEVEL).near.reference_backoffs[-1, -1]
         return sides
 
+    def make_levels(self) -> None:
+        """Make all levels of the budgets before the first question; answers are the same."""
+        self._levels.make_all()
+
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); see `Solver`.
 
