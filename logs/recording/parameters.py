@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.framing import scan_frames
+from uavctl.mavlink.framing import read_single_frame_id, scan_frames
 from uavctl.mavlink.message_layout import MessageLayout, decode_text
 from uavctl.records import Datagram, Record, ToldParameter
 
@@ -69,7 +69,10 @@ class ParameterReader:
             self._take_bytes(record)
 
     def _take_bytes(self, datagram: Datagram) -> None:
-        data = self._partial_frames.pop(datagram.link, b"") + datagram.data
+        partial, message_id = self._partial_frames.pop(datagram.link, b""), read_single_frame_id(datagram.data)
+        if not partial and message_id is not None and message_id not in _LAYOUTS:
+            return  # one frame that tells nothing of parameters, as most datagrams
+        data = partial + datagram.data
         scan = scan_frames(data, final=False, is_aligned=self._is_aligned.get(datagram.link, True))
         if scan.consumed < len(data):
             self._partial_frames[datagram.link] = data[scan.consumed :]

@@ -183,6 +183,7 @@ _MAX_TIME_NS = 2**64 - 1
 MATRICES = ("inputs", "states", "backoff_x", "backoff_u")  # of a plan, rounded in recordings
 DIGITS = 4  # of them: of 3 m, a millimetre
 _MIN_ROUNDED = 1e-12  # a smaller number is left as it is: its power of ten would not be exact
+_POWERS = 10.0 ** np.arange(309.0)  # of ten
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -245,8 +246,8 @@ def _round(values: Array) -> Array:
     size = np.abs(values)
     counts = (size > _MIN_ROUNDED) & (size < np.inf)
     # scale = 10^(digits − 1 − floor(log10 |x|)), rounded = rint(x · scale) / scale
-    digits = DIGITS - 1 - np.floor(np.log10(np.where(counts, size, 1.0)))
-    up, down = 10.0 ** np.maximum(digits, 0.0), 10.0 ** np.maximum(-digits, 0.0)  # exact powers: no digit is added
+    digits = (DIGITS - 1 - np.floor(np.log10(np.where(counts, size, 1.0)))).astype(np.intp)
+    up, down = _POWERS.take(digits, mode="clip"), _POWERS.take(-digits, mode="clip")  # exact: no digit is added
     with np.errstate(over="ignore"):
         rounded = np.rint(values / down * up) / up * down
     return np.where(counts & np.isfinite(rounded), rounded, values)

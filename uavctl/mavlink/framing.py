@@ -105,6 +105,17 @@ def _is_checksum_right(frame: bytes, header: _FrameHeader) -> bool:
     return _compute_checksum(frame[1:end], header.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
 
 
+def read_single_frame_id(data: bytes) -> int | None:
+    """Return the message id of bytes whose length is that of the frame at their begin; None for any other bytes.
+
+    No checksum is compared.
+    """
+    if not data or data[0] not in _MAGIC:
+        return None
+    header = _parse_header(data, 0)
+    return header.message_id if header is not None and header.length == len(data) else None
+
+
 def is_frame(data: bytes) -> bool:
     """Return whether bytes are one whole frame of a known id with the right checksum."""
     if not data or data[0] not in _MAGIC or _has_unknown_flags(data, 0):

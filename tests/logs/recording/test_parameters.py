@@ -71,6 +71,15 @@ def test_a_stream_is_read_however_it_is_cut(size: int) -> None:
     assert {name: one.value for name, one in found.items()} == {f"P{number}": number for number in range(40)}
 
 
+def test_the_rest_of_a_frame_may_look_like_another_frame() -> None:
+    """Its bytes begin as those of a frame of their length, of message 16640."""
+    (value,) = struct.unpack("<f", b"\xfd\x0f\x00?")
+    frame = told("A", value, REAL32)
+    rest = frame[10:]
+    assert len(rest) == 12 + rest[1] and int.from_bytes(rest[7:10], "little") == ord("A") << 8
+    assert read([heartbeat(3), frame[:10], rest])["A"].value == pytest.approx(value)
+
+
 def test_what_is_damaged_tells_nothing() -> None:
     bad = bytearray(told("A", 1.0, INT32))
     bad[12] ^= 1
