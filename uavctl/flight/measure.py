@@ -327,7 +327,8 @@ def _count_innovation(
 ) -> SpreadState:
     """Count the innovations (n_axes,) of a position for the spread, where they show more than the camera's noise."""
     index = kalman.measured_index[: len(innovations)]
-    predicted, noise = belief.cov[index, index], read_measurement(kalman, corrected)[1][: len(index)]
+    predicted = belief.cov[index, index]
+    noise = np.full(len(index), compute_position_variance(kalman.parameters, corrected))
     if predicted.sum() < noise.sum():
         return spread
     # s² = P + R

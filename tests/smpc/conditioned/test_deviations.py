@@ -79,7 +79,8 @@ def test_widened_back_offs_leave_half_of_the_room_between_opposite_limits() -> N
     plain = rng.uniform(0.0, 1.0, (steps, 4))
     opposite = find_opposite_rows(c)
     assert opposite.tolist() == [[0, 2]]
-    assert bound_widening(plain, plain, quantiles, b, opposite).tolist() == plain.tolist()
+    for narrower in (0.3 * plain, plain):
+        assert bound_widening(narrower, plain, quantiles, b, opposite).tolist() == narrower.tolist()
     bounded = bound_widening(4.0 * plain, plain, quantiles, b, opposite)
     assert bounded[:, [1, 3]].tolist() == (4.0 * plain)[:, [1, 3]].tolist()
     is_bounded = []

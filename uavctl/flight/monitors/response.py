@@ -26,6 +26,7 @@ sets in at once, 3 with 8 to 12 m/s, 4 where it reverses at once, 1 with 0.1 s o
 from __future__ import annotations
 
 import math
+import operator
 from bisect import bisect_right
 from collections.abc import Sequence
 from operator import itemgetter
@@ -275,7 +276,8 @@ def compute_onset_evidence(state: ResponseState, parameters: EnvelopeParameters)
     best, since_ns = (0.0, ""), state.samples[-1][0] - ONSET_NS
     if state.samples[0][0] > since_ns:
         return best
-    recent = _sum_samples([sample for at_ns, sample in state.samples if at_ns > since_ns])
+    first = bisect_right(state.samples, since_ns, key=_TIME)
+    recent = _sum_samples([sample for _, sample in state.samples[first:]])
     for group in _GROUPS:
         if _compute_exact_cost(recent, state.baseline, group, noise_mps2, jump_mps2) > ONSET * NEAR:
             costs = _compute_costs(state, group, noise_mps2, jump_mps2, since_ns, parameters.lag_s)
@@ -287,11 +289,9 @@ def _sum_samples(numbers: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
     """Sum samples alike: w, w e (3), w e² (3), with e of a right response."""
     weights = [sample[0] for sample in numbers]
     left = [[sample[1 + axis] - sample[4 + axis] for sample in numbers] for axis in range(3)]
-    return (
-        sum(weights),
-        *(sum(w * e for w, e in zip(weights, row, strict=True)) for row in left),
-        *(sum(w * e * e for w, e in zip(weights, row, strict=True)) for row in left),
-    )
+    weighted = [list(map(operator.mul, weights, row)) for row in left]
+    squares = [map(operator.mul, products, row) for products, row in zip(weighted, left, strict=True)]
+    return (sum(weights), *map(sum, weighted), *map(sum, squares))
 
 
 def _compare(costs: list[float], group: _Group) -> tuple[float, str]:

@@ -421,7 +421,9 @@ class ConditionedSolver:
         key = id(allocation), preview.level, preview.age, preview.widening, preview.silence_widening, cov_bytes
         if self._cached_backoffs is None or self._cached_backoffs[0] != key:
             plain, age = self._deviations.compute(preview.cov), preview.age
-            sigma = bound_widening(preview.widening * plain, plain, allocation.quantiles[age], self._b, self._opposite)
+            sigma = preview.widening * plain
+            if preview.widening > 1.0:
+                sigma = bound_widening(sigma, plain, allocation.quantiles[age], self._b, self._opposite)
             if not allocation.follows_age:
                 sigma[len(sigma) - 1 - age :] *= preview.silence_widening
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
