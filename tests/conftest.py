@@ -6,8 +6,10 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
@@ -58,6 +60,25 @@ def _no_waiting_for_the_disk() -> Iterator[None]:
     """Nothing here cuts the power, and without that nobody can see whether a file has reached the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _flights_share_what_they_need() -> Iterator[None]:
+    """Flights of equal configurations share a design and its solver.
+
+    And no flight collects garbage among all that the tests' process holds: test_realtime.py does.
+    """
+    from shared_designs import share_designs
+
+    @contextmanager
+    def leave_garbage() -> Iterator[Any]:
+        yield SimpleNamespace(after_tick=lambda ticked, lateness_ns: None)
+
+    with pytest.MonkeyPatch.context() as patch:
+        share_designs(patch)
+        for command in ("services", "loopback"):
+            patch.setattr(f"uavctl.cli.{command}.control_garbage_collection", leave_garbage)
         yield
 
 

@@ -1,0 +1,44 @@
+"""Designs, and solvers of designs, that flights of one test process share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import pytest
+from msgspec.structs import replace
+
+from uavctl.config import Config, load_config
+from uavctl.smpc.answer import Solver
+from uavctl.smpc.conditioned.design import AnyDesign
+from uavctl.wiring import controller
+
+Built = TypeVar("Built")
+KEPT = 24  # more than the configurations that the tests of a file take turns with
+SIM = load_config("room").sim
+
+
+def share_designs(patch: pytest.MonkeyPatch) -> None:
+    """Build each design, and its solver, once: no answer of a solver depends on earlier questions.
+
+    test_shortcut.py and test_conditioned.py show that. A design does not depend on the simulated vehicle.
+    """
+    build_solver = controller.build_solver
+    share_solver = lru_cache(KEPT)(build_solver)
+
+    def find_solver(design: AnyDesign, config: Config) -> Solver:
+        return (build_solver if config.smpc.controller else share_solver)(design, replace(config, sim=SIM))
+
+    patch.setattr(controller, "build_design", _share(controller.build_design))
+    patch.setattr(controller, "build_conditioned", _share(controller.build_conditioned))
+    patch.setattr(controller, "build_solver", find_solver)
+
+
+def _share(build: Callable[..., Built]) -> Callable[..., Built]:
+    shared = lru_cache(KEPT)(build)
+
+    def find(config: Config, **more: Any) -> Built:
+        return build(config, **more) if more else shared(replace(config, sim=SIM))
+
+    return find
