@@ -5,10 +5,16 @@
 
 from __future__ import annotations
 
+import io
+import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import coverage
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 # The monitors of the vehicle's motion work on one state, and have their tests together.
@@ -49,21 +55,60 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }
 
 
-def what_is_not_run(tests: tuple[str, ...]) -> str:
-    """Run the tests of some modules alone, once; return what they printed if one fails or a branch is not run."""
-    modules = ",".join(module for module, own in TARGETS.items() if own == tests)
+IMPORT = ""  # the context of what is run before the first test
+
+
+def list_own_tests() -> list[str]:
+    """Return the files of all own tests."""
+    return list(dict.fromkeys(test for tests in TARGETS.values() for test in tests))
+
+
+class FileContexts:
+    """Plugin of pytest: attributes the branches that a test runs to the test's file."""
+
+    def __init__(self, measured: coverage.Coverage) -> None:
+        self._measured = measured
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """Attribute all that follows to the file of a test that begins."""
+        self._measured.switch_context(nodeid.partition("::")[0])
+
+
+def measure_branches(data_file: str) -> int:
+    """Run the own tests of all modules, each test once; write which branches each file's tests run."""
+    measured = coverage.Coverage(data_file, branch=True, include=list(TARGETS))
+    measured.start()
+    code = pytest.main(["-q", "-n", "0", "-p", "no:cacheprovider", *list_own_tests()], plugins=[FileContexts(measured)])
+    measured.stop()
+    measured.save()
+    return int(code)
+
+
+def find_missing_branches() -> str:
+    """Run the own tests in a process of its own; return its output if one fails, else what they do not run.
+
+    A branch counts for a module only if one of the module's own tests runs it, or its import does.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        coverage = [sys.executable, "-m", "coverage"]
-        data = f"--data-file={folder}/coverage"
-        pytest = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
-        commands = (
-            [*coverage, "run", data, "--branch", f"--include={modules}", *pytest],
-            [*coverage, "report", data, "--show-missing", "--fail-under=100"],
+        data_file = f"{folder}/coverage"
+        command = [sys.executable, __file__, data_file]
+        done = subprocess.run(
+            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
-        for command in commands:
-            done = subprocess.run(
-                command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
-            )
-            if done.returncode != 0:
-                return done.stdout
-    return ""
+        return done.stdout if done.returncode else report_missing_branches(data_file, TARGETS)
+
+
+def report_missing_branches(data_file: str, targets: Mapping[str, Sequence[str]]) -> str:
+    """Return the report of modules with a branch that their own tests do not run; empty if there is none."""
+    reports = []
+    for module, tests in targets.items():
+        contexts = [f"^{re.escape(context)}$" for context in (IMPORT, *tests)]
+        measured, text = coverage.Coverage(data_file), io.StringIO()
+        measured.load()
+        if measured.report(include=[module], contexts=contexts, show_missing=True, file=text) < 100.0:
+            reports.append(text.getvalue())
+    return "\n".join(reports)
+
+
+if __name__ == "__main__":
+    sys.exit(measure_branches(*sys.argv[1:]))

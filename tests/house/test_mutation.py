@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
 
+import coverage
 import mutation
 import pytest
 from mutants import find_mutants
-from safety_core import ROOT, TARGETS
+from safety_core import ROOT, TARGETS, FileContexts, report_missing_branches
 
 TOY = b'''"""A module of three lines."""
 
@@ -40,6 +42,23 @@ def test_a_change_that_no_test_sees_survives_and_the_others_are_killed(tmp_path:
     }
     survivors = mutation.find_survivors(module, mutants, [tests], 2)
     assert [one.after for one in survivors] == ["return largest if value >= largest else value"]
+
+
+def test_a_branch_counts_for_a_module_only_if_its_own_tests_run_it(tmp_path: Path) -> None:
+    module, data_file = tmp_path / "toy.py", str(tmp_path / "data")
+    module.write_text("def limit(value):\n    if value > 7:\n        return 7\n    return value\n", encoding="utf-8")
+    measured = coverage.Coverage(data_file, branch=True, include=[str(module)])
+    contexts = FileContexts(measured)
+    measured.start()
+    limit = runpy.run_path(str(module))["limit"]
+    for nodeid, value in (("small.py::test_1", 5), ("large.py::test_2", 9), ("small.py::test_3", 6)):
+        contexts.pytest_runtest_logstart(nodeid)
+        limit(value)
+    measured.stop()
+    measured.save()
+    both, *single = (("small.py", "large.py"), ("small.py",), ("large.py",))
+    assert report_missing_branches(data_file, {str(module): both}) == ""
+    assert all("toy.py" in report_missing_branches(data_file, {str(module): tests}) for tests in single)
 
 
 @pytest.mark.parametrize(
