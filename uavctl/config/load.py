@@ -12,6 +12,7 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
@@ -447,6 +448,12 @@ def _find_foreign_keys(table: Mapping[str, Any]) -> Iterator[ConfigProblem]:
         )
 
 
+@cache
+def _find_fields(section: type[Section]) -> Mapping[str, FieldInfo]:
+    """Return the fields of a section by their keys; to find them takes as long as all the rest of a load."""
+    return {field.encode_name: field for field in msgspec.structs.fields(section)}
+
+
 def decode(
     section: type[Section],
     table: Mapping[str, Any],
@@ -459,7 +466,7 @@ def decode(
 
     Keys in `needed` have to be there though they have a default.
     """
-    fields = {field.encode_name: field for field in msgspec.structs.fields(section)}
+    fields = _find_fields(section)
     problem_count = len(problems)
     unknown = [key for key in table if key not in fields]
     problems.extend(_describe_unknown_key(path + key, key, tuple(fields), path) for key in unknown[:_MAX_UNKNOWN])
