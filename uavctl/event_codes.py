@@ -45,6 +45,7 @@ class EventCode(StrEnum):
     SAMPLE_FROZEN = "sample-frozen"  # a source repeats its value although the vehicle moves
     SAMPLE_REPEATED = "sample-repeated"  # a source repeats its value, and it may be frozen
     SAMPLE_JUMP = "sample-jump"  # a position that the vehicle cannot have come to
+    POSITIONS_LATE = "positions-late"  # the camera system smooths, or stamps too late; it is counted in
     # Solver
     SOLVE_INFEASIBLE = "solve-infeasible"
     SOLVE_INACCURATE = "solve-inaccurate"

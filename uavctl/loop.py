@@ -72,6 +72,7 @@ CONSOLE_CODES = frozenset(
         EventCode.BIAS_AT_BOUND,
         EventCode.BIAS_FREE,
         EventCode.STRONG_PUSH,
+        EventCode.POSITIONS_LATE,
         EventCode.CONTROLLER_FAULT,
         EventCode.HUNG_UP,
         EventCode.CONNECTION_SILENT,

@@ -235,6 +235,28 @@ def weaken_samples(history: FilterHistory, std_m: float) -> FilterHistory:
     )
 
 
+def shift_positions(kalman: Kalman, history: FilterHistory, shift: Callable[[int], tuple[Vec3, Vec3]]) -> FilterHistory:
+    """Move the positions of the window, as if they had come so; what was before it moves along.
+
+    Args:
+        shift: Gives how far positions [m] and velocities [m/s] of a time move.
+    """
+    entries = []
+    for entry in history.entries:
+        if entry.sample is not None:
+            moved, _ = shift(entry.key[0])
+            north, east, down = (p + m for p, m in zip(entry.sample.position_m, moved, strict=True))
+            entry = replace(entry, sample=replace(entry.sample, position_m=(north, east, down)))
+        entries.append(entry)
+    anchor, belief = history.anchor, history.anchor.belief
+    if belief is not None:
+        values = [vector[axis] for vector in shift(belief.at_ns) for axis in kalman.axes]
+        mean = belief.mean.copy()
+        mean[kalman.measured_index] += values
+        anchor = FilterState(replace(belief, mean=mean), anchor.input)
+    return FilterHistory(history.origin_ns, history.window_begin_ns, anchor, entries, [])
+
+
 def note_input(history: FilterHistory, at_ns: int, u: Array | None, belief: Belief | None = None) -> FilterHistory:
     """Note that an input acts from now on.
 

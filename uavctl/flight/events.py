@@ -23,6 +23,7 @@ from uavctl.flight.link_estimate import LinkCounts, count_step, estimate_link
 from uavctl.flight.measure import Measured
 from uavctl.flight.monitors.acceleration import describe_push
 from uavctl.flight.monitors.engaged import MonitorState
+from uavctl.flight.monitors.smoothing import SmoothingTrack
 from uavctl.flight.orders import Ordered
 from uavctl.flight.risk import report_saturation, update_risk
 from uavctl.flight.risk_state import RiskGroup
@@ -97,6 +98,7 @@ def report_events(
         *ordered.answers,
         *_report_faults(state, context, measured, supervised, decided),
         *_report_samples(context, measured),
+        *_report_delay(state.estimator.sources.smoothing, measured.samples.sources.smoothing, at_ns),
         *_report_decision(context, ordered, decided),
         *_report_link(link_alarms, before.link_alarms, link),
         *_report_inertial(before.inertial, inertial, at_ns),
@@ -137,6 +139,13 @@ def _report_samples(context: TickContext, measured: Measured) -> Iterable[Event]
     if context.inputs.missed_ticks:
         text = "ticks were missed; they are not made up for"
         yield _make_event(at_ns, Severity.WARNING, EventCode.MISSED_TICKS, text, context.inputs.missed_ticks)
+
+
+def _report_delay(before: SmoothingTrack, now: SmoothingTrack, at_ns: int) -> Iterable[Event]:
+    """Report a delay of positions where it begins to count."""
+    if now.late_s and not before.late_s:
+        text = f"positions are smoothed, or late by {now.late_s:.2f} s beside their stamps: this is counted in"
+        yield _make_event(at_ns, Severity.WARNING, EventCode.POSITIONS_LATE, text)
 
 
 def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -> Iterable[Event]:

@@ -37,6 +37,7 @@ from uavctl.flight.estimator import (
     is_mark_due,
     move_window,
     predict_belief,
+    shift_positions,
     update_inertial,
     weaken_samples,
 )
@@ -48,10 +49,11 @@ from uavctl.flight.kalman import (
     read_capture_ns,
     read_measurement,
 )
-from uavctl.flight.monitors import frozen, jumps, noise, outliers
+from uavctl.flight.monitors import frozen, jumps, noise, outliers, smoothing
 from uavctl.flight.monitors.frozen import LastMotionNs, PredictedSample
 from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
 from uavctl.flight.monitors.outliers import OutlierObservation, OutlierTrack, Reach
+from uavctl.flight.monitors.smoothing import DelayChange, SmoothingTrack
 from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict
 from uavctl.flight.state import ControlState, InertialReading, SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleStatus
@@ -83,6 +85,7 @@ class Measured(msgspec.Struct, frozen=True, eq=False):
     samples: GatedSamples  # its history is the one before restart and inertial data
     inertial: InertialReading | None
     restarted: bool  # whether the filter began anew
+    delay_change: DelayChange | None = None  # change of the delay of positions that counts; None for none
 
 
 def measure(state: ControlState, context: TickContext) -> Measured:
@@ -96,6 +99,10 @@ def measure(state: ControlState, context: TickContext) -> Measured:
     sources = estimator.sources
     if not context.was_in_control:
         sources = replace(sources, jumps=jumps.suspend(sources.jumps, inputs.at_ns))
+    track, delay_change = _update_delay(sources.smoothing, state, context)
+    sources = replace(sources, smoothing=track)
+    if delay_change is not None:
+        history = shift_positions(kalman, history, delay_change.shift)
     samples = gate_samples(
         kalman, controller.reach, history, sources, inputs, controller.horizon, estimator.consecutive_samples
     )
@@ -107,7 +114,8 @@ def measure(state: ControlState, context: TickContext) -> Measured:
         history = update_inertial(kalman, history, inputs.inertial)
     if is_due and not restarted:  # last, as samples before the boundary would change it
         history = insert_mark(kalman, history, inputs.at_ns)
-    return Measured(history, pending_inputs, samples, _read_inertial(estimator.inertial, inputs), restarted)
+    inertial = _read_inertial(estimator.inertial, inputs)
+    return Measured(history, pending_inputs, samples, inertial, restarted, delay_change)
 
 
 def gate_samples(
@@ -148,6 +156,15 @@ def gate_samples(
         source_moved=sources.outliers is not None and sources.outliers.has_moved(reach.parameters),
         all_absurd=sources.absurd is not None and sources.absurd.has_moved(reach.parameters),
     )
+
+
+def _update_delay(
+    track: SmoothingTrack, state: ControlState, context: TickContext
+) -> tuple[SmoothingTrack, DelayChange | None]:
+    """Update the delay of positions; none counts while others fly, or while the vehicle's own velocity is wrong."""
+    if not context.was_in_control or state.monitors.engaged.velocity_change.velocity_wrong_ns is not None:
+        return smoothing.forget(track)
+    return smoothing.adopt(smoothing.note_velocity(track, context.inputs.motion))
 
 
 def _restart(kalman: Kalman, samples: GatedSamples, at_ns: int) -> GatedSamples:
@@ -218,6 +235,7 @@ def _gate_in_order(
         if reason is None:
             if belief is None:
                 sources = replace(sources, noise=noise.update(sources.noise, sample, at_ns))
+            sources = replace(sources, smoothing=smoothing.update(sources.smoothing, at_ns, sample.position_m))
             accepted.append(corrected)
         else:
             refused.append((sample, reason))
@@ -337,11 +355,12 @@ def _count_innovation(
 
 
 def _correct_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -> PositionSample:
-    """Return a sample with the measured noise as standard deviation, less the shift of jumps."""
+    """Return a sample with the measured noise as standard deviation, less the shift of jumps, plus its lag."""
     std_m, shift_m = max(sample.std_m, sources.noise.std_m), sources.jumps.compute_shift_m(at_ns)
-    if std_m == sample.std_m and not any(shift_m):
+    lag_m = sources.smoothing.compute_lag_m(at_ns)
+    if std_m == sample.std_m and not any(shift_m) and not any(lag_m):
         return sample
-    north, east, down = (p - s for p, s in zip(sample.position_m, shift_m, strict=True))
+    north, east, down = (p - s + lag for p, s, lag in zip(sample.position_m, shift_m, lag_m, strict=True))
     return replace(sample, position_m=(north, east, down), std_m=std_m)
 
 

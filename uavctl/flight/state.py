@@ -17,6 +17,7 @@ from uavctl.flight.monitors.frozen import LastMotionNs, SourceTracks
 from uavctl.flight.monitors.jumps import JumpTrack
 from uavctl.flight.monitors.noise import NoiseTrack
 from uavctl.flight.monitors.outliers import OutlierTrack
+from uavctl.flight.monitors.smoothing import SmoothingTrack
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.flight.risk_state import RiskGroup
 from uavctl.records import Command, ControlMode, Plan, Vec3
@@ -34,6 +35,7 @@ class SourceHealth(msgspec.Struct, frozen=True, eq=False):
     tracks: SourceTracks = msgspec.field(default_factory=dict)  # what each source has shown
     noise: NoiseTrack = NoiseTrack()  # noise of positions that were believed
     jumps: JumpTrack = JumpTrack()  # jumps between two solutions
+    smoothing: SmoothingTrack = SmoothingTrack()  # how far positions are behind the vehicle's own velocity
     spread: SpreadState = SpreadState()  # how far positions are from their predictions
     last_motion_ns: LastMotionNs = (0, 0, 0)  # when the vehicle last moved, each axis, by its own velocity
 

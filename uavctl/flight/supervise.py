@@ -307,6 +307,8 @@ def _update_engaged(
     if return_ordered or is_old or not _judge_prediction(before.engaged, view, context).is_none:
         observation = replace(observation, position_m=None)
     monitors = before.engaged
+    if measured.delay_change is not None:
+        monitors = engaged.shift_positions(monitors, measured.delay_change)
     starts = monitors.motion.began_ns is None
     if starts and before.unengaged.confirms_positions and reading is not None and not before.position_inconsistent:
         monitors = replace(monitors, agreed=True)

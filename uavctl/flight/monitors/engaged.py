@@ -21,9 +21,10 @@ from uavctl.flight.monitors.approach import ApproachState
 from uavctl.flight.monitors.braking import BrakingState
 from uavctl.flight.monitors.motion import Motion, TickObservation, take_position, update_motion
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, select_axes
-from uavctl.flight.monitors.observer import Observer
+from uavctl.flight.monitors.observer import Observer, shift_observer
 from uavctl.flight.monitors.outside import OutsideState
 from uavctl.flight.monitors.response import ResponseState
+from uavctl.flight.monitors.smoothing import DelayChange
 from uavctl.flight.monitors.velocity import VelocityState
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict
@@ -89,6 +90,14 @@ def update(
         approach=approach_state,
     )
     return state, _select_first(first, wrong_response, unresolved, is_out, no_effect, no_answer)
+
+
+def shift_positions(state: MonitorState, change: DelayChange) -> MonitorState:
+    """Move what was estimated of positions, as if they had come so; velocities are compared anew."""
+    motion = state.motion
+    if motion.observer is not None:
+        motion = replace(motion, observer=shift_observer(motion.observer, *change.shift(motion.observer.at_ns)))
+    return replace(state, motion=motion, velocity=VelocityState())
 
 
 def _update_with_position(

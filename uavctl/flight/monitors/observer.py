@@ -21,6 +21,7 @@ from operator import attrgetter, itemgetter
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.flight.limits import ZERO
@@ -185,6 +186,13 @@ def _correct_mean(mean: Array, position: Array, gain: Array, bound: float) -> tu
     innovation = (position - mean[0]).tolist()
     inside = [min(max(v, -bound), bound) for v in innovation]
     return mean + gain * np.array(inside), inside != innovation
+
+
+def shift_observer(observer: Observer, position_m: Vec3, velocity_mps: Vec3) -> Observer:
+    """Move the estimated positions and velocities of an observer."""
+    moved = np.array((position_m, velocity_mps, ZERO))
+    inertial = None if observer.inertial is None else observer.inertial + moved
+    return replace(observer, mean=observer.mean + moved, inertial=inertial)
 
 
 def measure_size_mps2(accel_mps2: Array | Vec3) -> float:
