@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 from deception_rig import BLACKOUT_S, DeceivedFlight, Deception, draw_flight, draw_hover, fly_deceived
+from soak_pairs import compute_outside_m
 
+from uavctl.config import load_config
 from uavctl.records import ControlMode
 
 OUTSIDE_M = 0.5  # beyond a wall or the ceiling
@@ -35,6 +37,14 @@ HOVERS = (
     (114, "flipped", "quadrotor"),
 )
 WORST_LINEAR = (287, 290, 316, 323)  # of 71 flights of the linear plant, both autopilots
+
+
+@pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
+@pytest.mark.parametrize(
+    "place_m", [(3.2, 0.0, -1.0), (-3.2, 0.0, -1.0), (0.0, 2.7, -1.0), (0.0, -2.7, -1.0), (0.0, 0.0, -2.7)]
+)
+def test_each_wall_and_the_ceiling_of_each_room_counts(preset: str, place_m: tuple[float, float, float]) -> None:
+    assert compute_outside_m(load_config(preset), place_m) == pytest.approx(0.2)
 
 
 @pytest.mark.slow

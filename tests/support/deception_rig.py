@@ -159,10 +159,10 @@ def _wrap_attitude(
 
     def estimate_distorted() -> Quaternion:
         w, x, y, z = estimate()
-        tilt = distorter.distort(get_time_s(), (x, y, z, w), deceives=get_time_s() >= deception.at_s)
-        norm = math.sqrt(sum(number * number for number in tilt)) or 1.0
-        x, y, z, w = (number / norm for number in tilt)
-        return w, x, y, z
+        # A quaternion and its negative are one attitude: with w > 0 its vector says all.
+        vector = tuple(math.copysign(1.0, w) * part for part in (x, y, z))
+        x, y, z = distorter.distort(get_time_s(), vector, deceives=get_time_s() >= deception.at_s)
+        return math.sqrt(max(1.0 - x * x - y * y - z * z, 0.0)), x, y, z
 
     return estimate_distorted
 

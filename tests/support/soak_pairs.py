@@ -55,8 +55,10 @@ class TrueFlight:
 
 def compute_outside_m(config: Config, position_m: Vec3) -> float:
     """How far a position is beyond walls and ceiling; the floor is the simulator's own."""
-    lower = [config.sets.state_lower[3 * i] for i in range(3)]
-    upper = [*(config.sets.state_upper[3 * i] for i in range(2)), math.inf]
+    # The states of an axis follow each other, its position first; models differ in how many an axis has.
+    states = len(config.sets.state_lower) // 3
+    lower = config.sets.state_lower[::states]
+    upper = [*config.sets.state_upper[: 2 * states : states], math.inf]
     rows = zip(position_m, lower, upper, strict=True)
     return max(max(low - value, value - high) for value, low, high in rows)
 
