@@ -34,6 +34,7 @@ from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import velocity
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.motion import Motion, PositionObservation, find_distance
+from uavctl.flight.monitors.observation import EnvelopeParameters
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.velocity import VelocityState
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
@@ -183,12 +184,51 @@ def test_positions_come_back_near_the_vehicle_s_own_way(silent_s: float, off_m: 
 # The ways of half a minute
 
 
+def believed(place_m: Vec3, parameters: EnvelopeParameters = PARAMETERS) -> PositionObservation:
+    """A position that was believed."""
+    observer = Observer(AT_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
+    return PositionObservation(AT_NS, np.array(place_m), False, False, Motion(), observer, seen(AT_NS), parameters)
+
+
+@pytest.mark.parametrize(
+    ("place_m", "off_m", "near"),
+    [
+        ((2.2, 0.0, -2.0), (-0.41, 0.0, 0.0), True),  # north by its own way: 0.39 m before the wall
+        ((2.2, 0.0, -2.0), (-0.29, 0.0, 0.0), False),  # 0.51 m before it
+        ((2.7, 0.0, -2.0), (0.41, 0.0, 0.0), False),  # further inside than positions say
+        ((-2.2, 0.0, -2.0), (0.41, 0.0, 0.0), True),
+        ((-2.2, 0.0, -2.0), (0.29, 0.0, 0.0), False),
+        ((-2.7, 0.0, -2.0), (-0.41, 0.0, 0.0), False),
+        ((0.0, 1.4, -2.0), (0.0, -0.41, 0.0), True),
+        ((0.0, -1.4, -2.0), (0.0, 0.41, 0.0), True),
+        ((0.0, 0.0, -3.4), (0.0, 0.0, 0.41), True),  # the ceiling
+        ((0.0, 0.0, -1.4), (0.0, 0.0, -0.41), False),  # the floor stops a vehicle
+        ((2.2, 0.0, -2.0), (0.0, -0.41, 0.0), False),  # along the wall
+    ],
+)
+def test_the_own_way_leads_to_a_wall_or_the_ceiling(place_m: Vec3, off_m: Vec3, near: bool) -> None:
+    assert velocity._leads_out(believed(place_m), list(off_m)) == near
+
+
+@pytest.mark.parametrize(("place_m", "begin_s"), [((2.6, 0.0, -2.0), 1.0), ((0.0, 0.0, -2.0), 2.0)])
+def test_a_drift_to_a_wall_is_found_at_half_the_distance(place_m: Vec3, begin_s: float) -> None:
+    """Positions stay, and the own way goes north: in 5 s by the bound, or by little more."""
+    within_m = (begin_s + 0.16 * 5.0) * PARAMETERS.disagreement_mps
+    places = ((START_NS - 5 * SECOND_NS, ZERO, ZERO),)
+    for off_m, breached in ((within_m, False), (just_more(within_m), True)):
+        now = (-off_m, 0.0, 0.0)
+        drift, *_ = velocity._find_drift(
+            VelocityState(places=places), ((START_NS, now),), np.array([now]), ZERO, believed(place_m)
+        )
+        assert (drift is not None) == breached
+
+
 def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorState, Verdict | None]:
     """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
     known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
     middle_ns = AT_NS - 256 * MS
     older = tuple((middle_ns - age_ns - n * SECOND_NS, ZERO, ZERO) for n in range(before, 0, -1))
-    places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0]), ZERO))
+    places = (*older, (middle_ns - age_ns, np.array([-off_m, 0.0, 0.0]), ZERO))
     return look(ZERO, vehicle_motion=AT_REST, places=places, **known)
 
 
@@ -588,7 +628,7 @@ def test_what_a_delay_leaves_may_be_as_large_as_the_bound() -> None:
     for off_m, breached in ((within_m, False), (just_more(within_m), True)):
         now = (off_m, -0.25, 0.0)  # 0.25 s late: the velocity has changed by 1 m/s
         drift, *_ = velocity._find_drift(
-            VelocityState(places=places), ((START_NS, now),), np.array([now]), ZERO, PARAMETERS
+            VelocityState(places=places), ((START_NS, now),), np.array([now]), ZERO, believed(ZERO)
         )
         assert (drift is not None) == breached
 
@@ -603,11 +643,11 @@ def test_the_delay_of_all_places_counts_now_and_is_found_anew_once_one_is_too_ol
     )
     kept, now, flown = places if first_age_s < 30.0 else places[1:], (-1.0, 0.0, 0.0), (5.0, 0.0, 0.0)
     state = VelocityState(places=places, aligned=velocity._align(places))
-    drift, after, _ = velocity._find_drift(state, ((START_NS, now),), np.array([now]), flown, PARAMETERS)
+    drift, after, _ = velocity._find_drift(state, ((START_NS, now),), np.array([now]), flown, believed(ZERO))
     assert drift is None and after[: len(kept)] == kept
     # Another delay that is known, 0.1 s, counts as long as no place is too old.
     state = structs.replace(state, aligned=(0.1, [[0.0, 0.0, 0.0]] * 5))
-    strict = replace(PARAMETERS, disagreement_mps=0.01)
+    strict = believed(ZERO, replace(PARAMETERS, disagreement_mps=0.01))
     drift, *_ = velocity._find_drift(state, ((START_NS, now),), np.array([now]), flown, strict)
     assert (drift is None) == (first_age_s > 30.0)
     assert drift is None or drift[1] == pytest.approx([-1.0 + 0.1 * 5.0, 0.0, 0.0])

@@ -5,7 +5,8 @@
    part that is the acceleration times the delay. What is left is compared with its bound. Then: end the plans.
 3. The mean offsets of half a minute show a frame that creeps: their change is compared with a bound that grows with
    time. Smoothing in a camera system explains a part: one delay for all, times the change of the velocity. Then: end
-   the plans.
+   the plans. The bound begins with half as much where the vehicle's own way leads it to a wall or the ceiling:
+   positions that stay where they were would let a slow drift carry it out.
 4. Velocities contradicted each other, and then no position came for 0.6 s. Then: end the plans.
 5. The first position after a silence lies far from the vehicle's own way through it. Then: end the plans.
 6. While positions that have come back correct the vehicle's own velocity, no difference counts.
@@ -50,6 +51,8 @@ SHORTEST = 0.3  # of the window: over less, two velocities are not compared
 PLACES_NS, PLACE_NS = 30_000_000_000, 1_000_000_000  # mean offsets are compared over so long, one for each such time
 # Of the disagreement: the bound of a change of offset begins with so many seconds of it, and grows by such a part.
 DRIFT_S, DRIFT_PART = 2.0, 0.16
+# The same where the own way comes so near to a limit. Recorded flights reached 0.7 of this: 0.27 m in 3.3 s.
+NEAR_DRIFT_S, NEAR_M = 1.0, 0.5
 LEAST_PLACES = 4  # that tell a drift from the delay of smoothing
 LEAST_OFFSETS = 3  # for a slope
 NOISE_SIGMA = 4.0  # standard deviations of a slope that chance may make
@@ -104,7 +107,7 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     velocity = _find_mean_velocity(begin, end, span_s)
     drift, places, aligned = None, (), None
     if not corrects:
-        drift, places, aligned = _find_drift(state, offsets, points, velocity, parameters)
+        drift, places, aligned = _find_drift(state, offsets, points, velocity, observation)
     apart = _remove_delay(slope, begin, middle, end, span_s)
     apart_mps = math.hypot(*apart)
     bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, observation.std_m)
@@ -171,14 +174,14 @@ def _find_step(path: tuple[tuple[int, Vector], ...], at_ns: int) -> Vector:
 
 
 def _find_drift(
-    state: VelocityState, offsets: Offsets, points: Array, velocity: Vector, parameters: EnvelopeParameters
+    state: VelocityState, offsets: Offsets, points: Array, velocity: Vector, observation: PositionObservation
 ) -> tuple[tuple[float, list[float]] | None, Places, Aligned | None]:
     """Find the time [s] in which offsets changed too much, and the change (3,) [m]; return too the places after it.
 
     Args:
         velocity: The vehicle's own mean velocity over the window (3,) [m/s].
     """
-    at_ns = sum([captured_ns for captured_ns, _ in offsets]) // len(offsets)
+    at_ns, parameters = sum([captured_ns for captured_ns, _ in offsets]) // len(offsets), observation.parameters
     # ō = Σ o_i / n
     mean: Array = np.add.reduce(points, axis=0) / len(offsets)
     place: list[float] = mean.tolist()
@@ -189,21 +192,35 @@ def _find_drift(
     now = place if aligned is None else [o + aligned[0] * v for o, v in zip(place, velocity, strict=True)]
     thens = [before for _, before, _ in places] if aligned is None else aligned[1]
     # No place is further away than the least bound, as a rule: then none needs its own.
-    is_any_far = max(map(math.dist, repeat(now), thens), default=0.0) > DRIFT_S * parameters.disagreement_mps
+    is_any_far = max(map(math.dist, repeat(now), thens), default=0.0) > NEAR_DRIFT_S * parameters.disagreement_mps
     for (since_ns, _, velocity_before), then in zip(places if is_any_far else (), thens, strict=False):
         s = (at_ns - since_ns) * 1e-9
-        # |ō - ō_0| > (2 s + 0.16 s) v_max
-        bound_m = (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps
-        if math.dist(now, then) <= bound_m:
-            continue
         off = _subtract(now, then)
+        if math.hypot(*off) <= (NEAR_DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps:
+            continue
         if aligned is None:
             off = _remove_smoothing(off, _subtract(velocity, velocity_before))
-        if math.hypot(*off) > bound_m:
+        # |ō - ō_0| > (2 s + 0.16 s) v_max
+        begin_s = NEAR_DRIFT_S if _leads_out(observation, off) else DRIFT_S
+        if math.hypot(*off) > (begin_s + DRIFT_PART * s) * parameters.disagreement_mps:
             return (s, off), places, aligned
     if not places or at_ns - places[-1][0] >= PLACE_NS:
         places, aligned = (*places, (at_ns, tuple(place), velocity)), None
     return None, places, aligned
+
+
+def _leads_out(observation: PositionObservation, off: list[float]) -> bool:
+    """Whether the vehicle's own way has come near a wall or the ceiling, nearer than positions, which are `off` it.
+
+    The floor does not count: it stops a vehicle.
+    """
+    parameters = observation.parameters
+    rows = zip(observation.position.tolist(), off, parameters.lower_m, (*parameters.upper_m[:2], math.inf), strict=True)
+    # p - Δō < p_min + 0.5 m, or beyond p_max - 0.5 m
+    return any(
+        (change > 0.0 and place - change < lower + NEAR_M) or (change < 0.0 and place - change > upper - NEAR_M)
+        for place, change, lower, upper in rows
+    )
 
 
 def _find_way(path: tuple[tuple[int, Vector], ...], offsets: Offsets) -> tuple[float, list[Vector | None]]:
