@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from uavctl.flight.limits import LimitsParameters, limit_setpoint
 from uavctl.records import Vec3
@@ -99,3 +101,33 @@ def test_every_setpoint_of_100000_random_steps_with_faults_is_finite_bounded_and
         limited_steps += bool(limited)
         sent = out
     assert limited_steps > 10_000
+
+
+TILTED = LimitsParameters(accel_mps2=(3.9, 3.9, 1.5), slew_mps3=15.0, tilt_rad=math.radians(20.0))
+ACCELS = st.tuples(*[st.floats(-50.0, 50.0)] * 3)
+
+
+@given(want=ACCELS, steps=st.lists(ACCELS, max_size=4))
+def test_thrust_never_leans_further_than_the_largest_tilt(want: Vec3, steps: list[Vec3]) -> None:
+    sent = ZERO
+    for wanted in (*steps, want):
+        sent, _ = limit_setpoint(wanted, sent, TICK_S, TILTED)
+        # thrust a - g, with g along down: its angle from the vertical
+        lean = math.atan2(math.hypot(sent[0], sent[1]), 9.81 - sent[2])
+        assert lean <= TILTED.tilt_rad + 1e-9
+
+
+def test_a_setpoint_beyond_the_tilt_keeps_its_direction() -> None:
+    sent, limited = limit_setpoint((3.0, 4.0 - 0.1, 0.0), (2.5, 3.2, 0.0), TICK_S, TILTED)
+    assert limited == ("tilt",)
+    assert math.hypot(sent[0], sent[1]) == pytest.approx(9.81 * math.tan(math.radians(20.0)))
+    assert sent[1] / sent[0] == pytest.approx(3.9 / 3.0)
+
+
+def test_all_corners_of_the_box_are_within_the_tilt() -> None:
+    north, east, down = TILTED.box_mps2
+    for corner in ((north, east, down), (-north, east, -down), (north, -east, down)):
+        assert limit_setpoint(corner, corner, TICK_S, TILTED)[1] == ()
+    further = (1.001 * north, 1.001 * east, down)
+    assert limit_setpoint(further, further, TICK_S, TILTED)[1] == ("tilt",)
+    assert LIMITS.box_mps2 == LIMITS.accel_mps2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uavctl.config import load_config, presets
-from uavctl.errors import DesignError
+from uavctl.errors import ConfigError, DesignError
 from uavctl.records import SolveStatus
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutSolver
@@ -107,3 +107,20 @@ def test_what_has_no_design_is_refused(override: str, key: str) -> None:
     with pytest.raises(DesignError) as caught:
         build_design(load_config("paper", [override]))
     assert caught.value.key == key
+
+
+def test_a_largest_tilt_bounds_plans_and_setpoints() -> None:
+    controller = build_controller(load_config("room-px4", ["limits.tilt_deg=20"]))
+    # (9.81 - 1.5) tan 20° / √2 = 2.139, and 0.6 of it free for a bias
+    assert controller.limits.box_mps2[:2] == pytest.approx((2.1387, 2.1387), abs=1e-4)
+    answer = controller.solver.solve(0, np.zeros(9), np.array([2.0, 0, 0, 2.0, 0, 0, -1.0, 0, 0]))
+    assert np.abs(answer.inputs[:, :2]).max() == pytest.approx(2.1387 - 0.6, abs=1e-4)
+    assert np.abs(answer.inputs[:, 2]).max() <= 0.9 + 1e-9
+
+
+def test_a_tilt_that_leaves_nothing_beside_the_bias_is_refused() -> None:
+    with pytest.raises(DesignError) as refused:
+        build_controller(load_config("room-px4", ["limits.tilt_deg=5"]))
+    assert refused.value.key == "limits.tilt_deg"
+    with pytest.raises(ConfigError):
+        load_config("room-px4", ["limits.tilt_deg=0"])

@@ -309,6 +309,10 @@ class LimitsConfig(Section, frozen=True, kw_only=True):
 
     accel_mps2: Annotated[Position, declare("largest acceleration setpoint north, east, down", "m/s²")]
     slew_mps3: Annotated[float, declare("largest change of a setpoint in a second, each axis", "m/s³", 1e-6, 1e6)]
+    tilt_deg: Annotated[
+        Annotated[float, Meta(ge=1, le=80)] | None,
+        declare("largest tilt that setpoints ask for, of both horizontal axes together; default: no limit", "deg"),
+    ] = None
 
 
 Bound = Annotated[float, Meta(gt=0, le=1e6)] | None

@@ -1,4 +1,9 @@
-"""Setpoint limiter: any acceleration becomes finite, bounded and slew-limited, whatever has asked for it."""
+"""Setpoint limiter: any acceleration becomes finite, bounded and slew-limited, whatever has asked for it.
+
+A multicopter tilts by φ with tan φ = |a_h| / (g - a_down). A largest tilt couples the horizontal axes: the cone
+|a_h| <= (g - a_down) tan φ_max. Plans keep the largest box inside of it that is alike for both axes, so each axis has
+limits of its own, and a plan keeps the deceleration that it counts on.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,8 @@ from dataclasses import dataclass
 from uavctl.records import Vec3
 
 AXES = ("north", "east", "down")
-NON_FINITE = "non-finite"
+NON_FINITE, TILT = "non-finite", "tilt"
+GRAVITY_MPS2 = 9.81
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
@@ -18,6 +24,20 @@ class LimitsParameters:
 
     accel_mps2: Vec3  # largest acceleration of each axis, north, east, down [m/s²]
     slew_mps3: float  # largest change in a second, each axis [m/s³]
+    tilt_rad: float = math.inf  # largest tilt that setpoints ask for [rad]; infinite: no cone
+
+    @property
+    def has_cone(self) -> bool:
+        """Whether there is a largest tilt."""
+        return math.isfinite(self.tilt_rad)
+
+    @property
+    def box_mps2(self) -> Vec3:
+        """Largest acceleration of each axis that the others leave to it, whatever they do [m/s²]."""
+        north, east, down = self.accel_mps2
+        # (g - a_max) tan φ_max / √2: at least thrust, both horizontal axes alike
+        each = (GRAVITY_MPS2 - down) * math.tan(self.tilt_rad) / math.sqrt(2.0) if self.has_cone else math.inf
+        return min(north, each), min(east, each), down
 
 
 def limit_setpoint(
@@ -31,7 +51,7 @@ def limit_setpoint(
         tick_s: Time since then [s].
 
     Returns:
-        The acceleration to send, and the names of what was changed ("non-finite", "clamp-north", "slew-down" ...).
+        The acceleration to send, and the names of what was changed ("non-finite", "clamp-north", "slew-down", "tilt").
     """
     limited: list[str] = []
     if not all(map(math.isfinite, want_mps2)):
@@ -49,7 +69,14 @@ def limit_setpoint(
         if slewed != clamped:
             limited.append(f"slew-{axis}")
         out.append(slewed)
-    return (out[0], out[1], out[2]), tuple(limited)
+    north, east, down = out
+    # |a_h| <= (g - a_down) tan φ_max
+    radius = (GRAVITY_MPS2 - down) * math.tan(limits.tilt_rad) if limits.has_cone else math.inf
+    horizontal = math.hypot(north, east)
+    if horizontal > radius:
+        limited.append(TILT)
+        north, east = north * radius / horizontal, east * radius / horizontal
+    return (north, east, down), tuple(limited)
 
 
 def _clamp(value: float, lower: float, upper: float) -> float:

@@ -110,7 +110,7 @@ def build_spec(config: Config) -> DesignSpec:
     return DesignSpec(
         plant=plant if form is None else form.plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
-        input_set=_build_planned_inputs(config),
+        input_set=_build_planned_inputs(config, plant),
         q_x=np.diag(config.cost.state),
         q_u=np.diag(config.cost.input),
         horizon=smpc.horizon,
@@ -156,10 +156,11 @@ def build_problem(config: Config) -> ControlProblem:
     plant, sets = build_plant(config), config.sets
     q_x, q_u = np.diag(config.cost.state), np.diag(config.cost.input)
     target, u_target = compute_target_equilibrium(config, plant)
+    lower, upper = build_input_bounds(config, plant)
     return ControlProblem(
         plant=plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
-        input_set=Polytope.from_box(sets.input_lower, sets.input_upper),
+        input_set=Polytope.from_box(lower.tolist(), upper.tolist()),
         q_x=q_x,
         q_u=q_u,
         target=target,
@@ -182,7 +183,8 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
     Raises:
         DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovation_form`.
     """
-    problem = replace(build_problem(config), input_set=_build_planned_inputs(config))
+    problem = build_problem(config)
+    problem = replace(problem, input_set=_build_planned_inputs(config, problem.plant))
     for_flight = for_flight and bool(config.plant.axes)
     link, max_risk = build_ages(config), 1.0 - config.smpc.delta_x
     slew_mps3 = config.limits.slew_mps3 if for_flight else math.inf
@@ -212,10 +214,10 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
     return ConditionedDesign(solver, cov, design_id)
 
 
-def _build_planned_inputs(config: Config) -> Polytope:
+def _build_planned_inputs(config: Config, plant: Plant) -> Polytope:
     """Build the input set of the plans: the limits less bias_max, which is free for the compensation of a bias."""
     free = config.estimator.bias_max
-    lower, upper = (np.array(side) for side in (config.sets.input_lower, config.sets.input_upper))
+    lower, upper = build_input_bounds(config, plant)
     return Polytope.from_box((lower + free).tolist(), (upper - free).tolist())
 
 
@@ -347,7 +349,7 @@ def _compute_bias_bounds(config: Config) -> tuple[float, ...]:
 
 def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
     """Build the bounds of possible motion in flight, by the limits, the plant and the setpoint limiter."""
-    envelope, limits, position_limits = config.envelope, config.limits, get_position_limits_m(config)
+    envelope, position_limits = config.envelope, get_position_limits_m(config)
     lower, upper = map(list, zip(*(position_limits.get(axis, (-math.inf, math.inf)) for axis in AXES), strict=True))
     sizes_m = [high - low for low, high in zip(lower, upper, strict=True)]
     outside_m = [
@@ -366,7 +368,7 @@ def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
         lower_m=_make_vec3(lower),
         upper_m=_make_vec3(upper),
         outside_m=_make_vec3(outside_m),
-        brake_mps2=limits.accel_mps2,
+        brake_mps2=build_limits(config).box_mps2,
         lag_s=_make_vec3([lags_s.get(axis, 0.0) for axis in AXES]),
         unexplained_mps2=unexplained_mps2,
         disagreement_mps=envelope.disagreement_mps or DISAGREEMENT_TIME_S * unexplained_mps2,
@@ -383,6 +385,36 @@ def _has_independent_velocity(config: Config) -> bool:
 def _make_vec3(values: list[float]) -> Vec3:
     north, east, down = values
     return north, east, down
+
+
+def build_limits(config: Config) -> LimitsParameters:
+    """Return the parameters of the setpoint limiter.
+
+    Raises:
+        DesignError: The largest tilt leaves plans no acceleration.
+    """
+    limits, bias_max = config.limits, config.estimator.bias_max
+    if limits.tilt_deg is None:
+        return LimitsParameters(limits.accel_mps2, limits.slew_mps3)
+    parameters = LimitsParameters(limits.accel_mps2, limits.slew_mps3, math.radians(limits.tilt_deg))
+    left_mps2 = min(parameters.box_mps2[:2])
+    if left_mps2 <= bias_max:
+        raise DesignError(
+            "limits.tilt_deg",
+            f"{limits.tilt_deg:g} deg leaves {left_mps2:.2g} m/s² to each axis, and estimator.bias_max is {bias_max:g}",
+            "give a larger tilt, or a smaller bias_max or limits.accel_mps2 of down",
+        )
+    return parameters
+
+
+def build_input_bounds(config: Config, plant: Plant) -> tuple[Array, Array]:
+    """Return the least and the largest input (n_u,): those of `sets`, within the largest tilt."""
+    lower, upper = np.array(config.sets.input_lower), np.array(config.sets.input_upper)
+    limits = build_limits(config)
+    if not (limits.has_cone and plant.axes):
+        return lower, upper
+    box = plant.to_input(limits.box_mps2)
+    return np.maximum(lower, -box), np.minimum(upper, box)
 
 
 def _build_risk(config: Config, design: AnyDesign) -> RiskParameters | None:
@@ -407,7 +439,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
     """
     check_axes(config)
     design = build_flight_design(config) if design is None else design
-    estimator, fallback, limits = config.estimator, config.fallback, config.limits
+    estimator, fallback = config.estimator, config.fallback
     plant, outside = build_plant(config), config.smpc.controller
     return Controller(
         plant=plant,  # the plant of the design may be the one of the estimator
@@ -427,7 +459,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
             rate_rps=math.radians(config.mission.yaw_rate_dps),
         ),
         estimator=build_estimator(config),
-        input_bounds=(np.array(config.sets.input_lower), np.array(config.sets.input_upper)),
+        input_bounds=build_input_bounds(config, plant),
         fallback=FallbackParameters(
             brake_gain_1ps=fallback.brake_gain_1ps,
             brake_s=fallback.brake_s,
@@ -436,7 +468,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
             land=fallback.land,
             recover_samples=fallback.recover_samples,
         ),
-        limits=LimitsParameters(accel_mps2=limits.accel_mps2, slew_mps3=limits.slew_mps3),
+        limits=build_limits(config),
         position_gate=GateParameters(
             sigma=estimator.gate_sigma,
             margin_m=estimator.gate_m,

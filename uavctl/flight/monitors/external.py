@@ -80,7 +80,7 @@ def make_braking(
     return Braking(
         lower_m=np.array(parameters.lower_m)[index] - margin_m,
         upper_m=np.array(parameters.upper_m)[index] + margin_m,
-        accel_mps2=np.array(limits.accel_mps2)[index],
+        accel_mps2=np.array(limits.box_mps2)[index],
         lag_s=np.array(parameters.lag_s)[index],
         slew_mps3=limits.slew_mps3,
         gain_1ps=fallback.brake_gain_1ps,
