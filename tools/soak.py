@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--hours", type=float, default=1.0, help="virtual time with faults")
     parser.add_argument("--ticks", type=int, default=1_000_000, help="control ticks alone")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--out", type=Path, default=Path("flights/soak"), help="folder for recordings of what went wrong")
+    parser.add_argument("--out", type=Path, default=Path("flights/soak"), help="folder for recordings of failures")
     parser.add_argument("--json", action="store_true", help="figures as JSON, one document")
     given = parser.parse_args(arguments)
     if min(given.seeds, given.ticks) < 1 or not 0.0 < given.hours < math.inf or given.first < 0:
