@@ -8,15 +8,13 @@ from drawn_questions import draw_questions
 
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
-from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.working_set import WorkingSetGuess
-from uavctl.wiring.controller import build_controller
+from uavctl.wiring.controller import build_conditioned
 
 
 def requested(name: str) -> list[Answer]:
     """Answers to states from anywhere, of which most are on their way out faster than inputs can brake."""
-    solver = build_controller(load_config(name)).solver
-    assert isinstance(solver, ConditionedSolver)
+    solver = build_conditioned(load_config(name)).solver
     return [solver.solve(seq, *question) for seq, question in enumerate(draw_questions(solver, 60, 4))]
 
 
