@@ -27,7 +27,7 @@ def make_fleet(
 
     Each of the others has the system id and the seed of the one before plus one, and its ports lie one (UDP) or ten
     (TCP) higher; port 0, any free one, stays 0. They start 1 m apart within the limits of the position: eastwards in
-    rows, each 1 m north of the one before. What is configured to happen happens to all.
+    rows, each 1 m north of the one before. Configured faults happen to all.
 
     Raises:
         ConfigError: the system ids run out or meet the daemon's, or the limits have no room for all.

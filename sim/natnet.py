@@ -90,7 +90,7 @@ class NatNetPort:
         return []
 
     def write(self, data: bytes) -> None:
-        """Stream a frame with the pose of an ODOMETRY; what the channel has damaged is lost."""
+        """Stream a frame with the pose of an ODOMETRY; a frame that the channel has damaged is lost."""
         parser = mavlink.MAVLink(None)
         parser.robust_parsing = True
         for msg in parser.parse_buffer(data) or ():

@@ -117,7 +117,7 @@ class _TcpClient:
         return False
 
     def write(self, data: bytes) -> bool:
-        """Send in order what the socket takes now; return False if the client is gone or leaves too much unread."""
+        """Send in order as much as the socket takes; return False if the client is gone or leaves too much unread."""
         if self.greeting:
             self.backlog += self.greeting.pop(0)
         self.backlog += data

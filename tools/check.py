@@ -30,11 +30,11 @@ _PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWR
 
 
 class StageError(Exception):
-    """A stage failed; holds what its person needs to see."""
+    """A stage failed; holds the output for the reader."""
 
 
 def say(text: str) -> None:
-    """One line to the person who waits."""
+    """Print one line."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
@@ -62,7 +62,7 @@ def run(command: Sequence[str | Path], *, cwd: Path = ROOT, extra: Mapping[str, 
 
 
 def check_pages() -> str:
-    """The generated pages are what the types say."""
+    """The generated pages agree with the types."""
     for page, text in PAGES.items():
         if not page.exists() or page.read_text(encoding="utf-8") != text():
             raise StageError(f"{page.relative_to(ROOT)} is not up to date; run `make docs`")
@@ -83,7 +83,7 @@ def check_wheel() -> str:
         outside = {"PYTHONPATH": str(site)}
         where = run([sys.executable, "-P", "-c", "import uavctl; print(uavctl.__file__)"], cwd=folder, extra=outside)
         if not Path(where.strip()).is_relative_to(site):
-            raise StageError(f"the wheel was not what was imported, but {where.strip()}")
+            raise StageError(f"the wheel was not imported, but {where.strip()}")
         page = run([sys.executable, "-P", "-m", "uavctl", "docs", "faults"], cwd=folder, extra=outside)
         if page != (ROOT / "docs" / "faults.md").read_text(encoding="utf-8"):
             raise StageError("`uavctl docs faults` of the wheel does not show that page")
@@ -117,7 +117,7 @@ def check_tests(failed: threading.Event, *, everything: bool) -> str:
     """All tests, or those that are not slow; no test at all is a failure (exit code 5). They end early if `failed`.
 
     With `everything`, `check_core` runs the safety core's own tests, and they are left out here. A file's tests stay in
-    one process, so that what they share is made once; tests/conftest.py gives the order.
+    one process, so that shared parts are made once; tests/conftest.py gives the order.
     """
     command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
     command += ["-m", "not manual" if everything else "not slow and not manual"]
@@ -135,7 +135,7 @@ def check_tests(failed: threading.Event, *, everything: bool) -> str:
 
 
 def stages(failed: threading.Event, *, everything: bool) -> tuple[tuple[str, Callable[[], str]], ...]:
-    """All checks: what is told soonest first, and the types beside the tests, which take longest."""
+    """All checks: the quickest first, and the types beside the tests, which take longest."""
     slow = (
         ("wheel, outside the checkout", check_wheel),
         ("site of the manual", check_site),

@@ -120,7 +120,7 @@ def configuration_page() -> str:
 
 
 def tables(section: type[Section], path: str) -> Iterator[str]:
-    """A section's keys and those of its tables, as Markdown; `path` is what its keys begin with."""
+    """A section's keys and those of its tables, as Markdown; `path` is the prefix of its keys."""
     fields = msgspec.structs.fields(section)
     title = f"`[{path}]`" if path else "Top level"
     yield "\n".join(
@@ -374,8 +374,8 @@ A flight that the pilot began releases the vehicle. A flight with `--arm` reacts
 
 ## Another mode
 
-* `other`, because a stick or switch moved (RC_CHANNELS, a tenth of its way), a ground station ordered the mode, or only
-  a person chooses this mode and the vehicle does not report its remote control's channels: the person flies.
+* `other`: the person flies. Evidence: a stick or switch moved (RC_CHANNELS, a tenth of its way), or a ground station
+  ordered the mode. Without RC_CHANNELS a mode that only a person chooses is evidence, too.
 * `other`, because a failsafe explains the mode, and no stick moved ({_degrades()}): the same; exit code 1.
 * `unclear`, without such evidence: after our take-off, landing is requested after `climb_s`, unless a stick moves. Exit
   code 1.

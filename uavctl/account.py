@@ -1,4 +1,4 @@
-"""Account of a flight: what brought about its end, as the control loop and the shells that run it note on the way.
+"""Account of a flight: the causes of its end, as noted by the control loop and by the shells that run it.
 
 Its end is an `Ending`: console, `ctl status`, health, summary, page, JSON and exit code take it from there.
 1. Of several causes of an end, the first one counts; a later one only if it is known better (`_find_main_cause`).

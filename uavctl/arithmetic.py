@@ -22,10 +22,10 @@ _HEAD_BYTES = 8192  # of /proc/cpuinfo: the first processor
 
 
 def choose_arithmetic(flags: Set[str], environ: MutableMapping[str, str], begun: bool) -> str:
-    """Set the environment for portable arithmetic, if that is possible and nobody chose otherwise; say which it is.
+    """Set the environment for portable arithmetic, if possible and not chosen before; return its name.
 
     Args:
-        flags: What the processor can do, in the words of /proc/cpuinfo.
+        flags: Features of the processor, in the words of /proc/cpuinfo.
         environ: Environment of this process, which those that it starts inherit.
         begun: Whether numpy is loaded: it and OpenBLAS read the environment once.
     """

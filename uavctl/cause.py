@@ -88,7 +88,7 @@ class Cause(StrEnum):
 
 
 class CauseRank(StrEnum):
-    """Ranks of causes by what a pilot needs first, in this order; within a rank the earliest cause counts."""
+    """Ranks of causes in the order that a pilot needs; within a rank the earliest cause counts."""
 
     POWER = "power"  # it explains all that comes after
     LOST = "lost"  # the vehicle, or the room
@@ -128,16 +128,16 @@ CAUSES: dict[Cause, CauseText] = {
     _C.VEHICLE_RESTARTED: CauseText(_R.LOST, BAD, "Vehicle restarted", "the vehicle has started anew"),
     _C.VEHICLE_DISARMED: CauseText(_R.LOST, BAD, "Disarmed in flight", "the vehicle disarmed in flight"),
     _C.CONTROL_FAILED: CauseText(_R.LOST, BAD, "Controller failed", "the controller has failed"),
-    _C.RECORDING_CUT: CauseText(_R.BLIND, BAD, "Recording breaks off"),
-    _C.FLOWN_BLIND: CauseText(_R.BLIND, BAD, "Flown blind"),
-    _C.STOOD_STILL: CauseText(_R.BLIND, BAD, "Controller stood still"),
+    _C.RECORDING_CUT: CauseText(_R.BLIND, BAD, "Recording cut"),
+    _C.FLOWN_BLIND: CauseText(_R.BLIND, BAD, "Flown without positions"),
+    _C.STOOD_STILL: CauseText(_R.BLIND, BAD, "Control loop stopped"),
     _C.VEHICLE_FENCE: CauseText(_R.FAILSAFE, BAD, "The vehicle's own fence", "a fence of the vehicle's own took over"),
     _C.BATTERY_LOW: CauseText(_R.FAILSAFE, BAD, "Battery low"),
     _C.VEHICLE_POSITION_LOST: CauseText(_R.FAILSAFE, BAD, "The vehicle lost its position"),
     _C.VEHICLE_FAILSAFE: CauseText(
         _R.FAILSAFE, BAD, "Failsafe of the vehicle", "a failsafe of the vehicle's own took over"
     ),
-    _C.VEHICLE_ALARM: CauseText(_R.FAILSAFE, BAD, "The vehicle alarmed"),
+    _C.VEHICLE_ALARM: CauseText(_R.FAILSAFE, BAD, "Alarm of the vehicle"),
     _C.PILOT: CauseText(_R.TAKEN_OVER, CAUTION, "The pilot took over", "the pilot has taken over"),
     _C.GROUND_STATION: CauseText(
         _R.TAKEN_OVER, CAUTION, "A ground station took over", "a ground station has taken over"
@@ -152,16 +152,16 @@ CAUSES: dict[Cause, CauseText] = {
     _C.POSITIONS_ABSENT: CauseText(_R.POSITIONS, BAD, "No positions", "no positions came"),
     _C.POSITIONS_APART: CauseText(_R.POSITIONS, CAUTION, "Positions disagree"),
     _C.STAMPS_UNUSABLE: CauseText(_R.POSITIONS, BAD, "Time stamps unusable"),
-    _C.RELAY_ATTITUDE: CauseText(_R.POSITIONS, BAD, "Poses turned"),
+    _C.RELAY_ATTITUDE: CauseText(_R.POSITIONS, BAD, "Attitude of poses wrong"),
     _C.RELAY_SILENT: CauseText(_R.POSITIONS, BAD, "Relay silent"),
     _C.SILENCE: CauseText(_R.POSITIONS, CAUTION, "No positions for a while"),
     _C.ENVELOPE: CauseText(_R.ENDING, BAD, "Let go", "let go by the envelope"),
     _C.NOT_AS_ORDERED: CauseText(_R.ENDING, BAD, "Not as ordered"),
     _C.BEGIN_REFUSED: CauseText(_R.ENDING, BAD, "Refused by the vehicle"),
     _C.NOT_RISEN: CauseText(
-        _R.ENDING, BAD, "Never left the ground", "the vehicle disarmed before it had left the ground"
+        _R.ENDING, BAD, "Did not leave the ground", "the vehicle disarmed before it had left the ground"
     ),
-    _C.NOT_FLOWN: CauseText(_R.ENDING, CAUTION, "Nothing was flown", "nothing was flown"),
+    _C.NOT_FLOWN: CauseText(_R.ENDING, CAUTION, "No controlled flight", "nothing was flown"),
     _C.TAKE_OFF_NOT_BEGUN: _describe_bad_end("the take-off was not begun"),
     _C.MODE_REFUSED: _describe_bad_end("the mode to take off in was refused"),
     _C.ARMING_REFUSED: _describe_bad_end("arming was refused"),
@@ -182,17 +182,17 @@ CAUSES: dict[Cause, CauseText] = {
     _C.WAITING: _describe_bad_end("waiting"),
     _C.TOUCHED_LIMIT: CauseText(_R.QUALITY, CAUTION, "Touched a limit"),
     _C.BEYOND_LIMIT: CauseText(_R.QUALITY, CAUTION, "Beyond a limit"),
-    _C.FELL_BACK: CauseText(_R.QUALITY, CAUTION, "Fell back"),
-    _C.NOT_REACHED: CauseText(_R.QUALITY, CAUTION, "Not there yet", "the place was not reached"),
-    _C.OFF_TRACK: CauseText(_R.QUALITY, CAUTION, "Off its track"),
-    _C.WIND: CauseText(_R.QUALITY, CAUTION, "Pushed off"),
+    _C.FELL_BACK: CauseText(_R.QUALITY, CAUTION, "Fallback used"),
+    _C.NOT_REACHED: CauseText(_R.QUALITY, CAUTION, "Place not reached", "the place was not reached"),
+    _C.OFF_TRACK: CauseText(_R.QUALITY, CAUTION, "Far from the target"),
+    _C.WIND: CauseText(_R.QUALITY, CAUTION, "Strong push"),
     _C.VEHICLE_WARNED: CauseText(_R.QUALITY, CAUTION, "The vehicle warned"),
-    _C.SECOND_VEHICLE: CauseText(_R.QUALITY, CAUTION, "Another vehicle", "another vehicle was heard"),
+    _C.SECOND_VEHICLE: CauseText(_R.QUALITY, CAUTION, "Second vehicle", "another vehicle was heard"),
     _C.PLANS_RELAXED: CauseText(_R.DETAIL, CAUTION, "Plans relaxed"),
     _C.LINK_WORSE: CauseText(_R.DETAIL, CAUTION, "Link worse than designed"),
     _C.NO_VEHICLE: CauseText(_R.DETAIL, CAUTION, "No vehicle", "no vehicle was heard"),
     _C.NOT_ARMED: CauseText(_R.DETAIL, CAUTION, "Not armed"),
-    _C.ARMING_UNKNOWN: CauseText(_R.DETAIL, CAUTION, "Arming not known"),
+    _C.ARMING_UNKNOWN: CauseText(_R.DETAIL, CAUTION, "Arming unknown"),
     _C.ALL_WELL: CauseText(_R.NONE, GOOD, "All well"),
     _C.NOTHING_FOUND: CauseText(_R.NONE, GOOD, "Nothing found"),
     _C.LANDED_AFTER_MISSION: _describe_wanted_end("landed at the end of the mission"),

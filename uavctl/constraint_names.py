@@ -55,7 +55,7 @@ def _name_row(number: int, row: Sequence[float], states: Sequence[tuple[str, str
 
 
 def describe_relaxed(names: ConstraintNames, relaxed: GaveWay) -> str:
-    """Describe one constraint that gave way."""
+    """Describe one relaxed constraint."""
     if relaxed.constraint == "equilibrium":
         name, unit = names.states[relaxed.index]
         return f"rest was missed by {_amount(relaxed.amount, unit)} of {name} in stage {relaxed.stage}"
@@ -72,17 +72,17 @@ def describe_relaxed(names: ConstraintNames, relaxed: GaveWay) -> str:
 
 
 def find_worst(names: ConstraintNames, given: Iterable[GaveWay]) -> GaveWay:
-    """Find the constraint that gave way most, each in its own unit; a limit of a state first, the first of equals."""
+    """Find the most relaxed constraint, each in its own unit; a limit of a state first, the first of equals."""
     return max(given, key=lambda relaxed: compute_severity(names, relaxed))
 
 
 def compute_severity(names: ConstraintNames, relaxed: GaveWay) -> tuple[bool, float]:
-    """Compute the rank of a constraint that gave way: limits of states above all else, then by the amount."""
+    """Compute the rank of a relaxed constraint: limits of states above all else, then by the amount."""
     return relaxed.constraint not in _WITHOUT_ROW, measure_excess(names, relaxed)
 
 
 def measure_excess(names: ConstraintNames, relaxed: GaveWay) -> float:
-    """Return by how much a constraint gave way, in the unit of its state."""
+    """Return the amount by which a constraint is relaxed, in the unit of its state."""
     return relaxed.amount / (1.0 if relaxed.constraint in _WITHOUT_ROW else names.rows[relaxed.index][2])
 
 

@@ -19,7 +19,7 @@ class UsageError(UavctlError):
 
 
 class ExtraMissingError(UsageError):
-    """What is asked for needs a package that is not installed."""
+    """A request needs a package that is not installed."""
 
     def __init__(self, package: str, extra: str) -> None:
         self.package = package

@@ -1,4 +1,4 @@
-"""Codes of events: what happened, for programs. The text of an event says it to a person."""
+"""Codes of events, for programs. The text of an event is for people."""
 
 from __future__ import annotations
 

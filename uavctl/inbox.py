@@ -49,7 +49,7 @@ class Inbox:
         return True
 
     def take(self, at_ns: int) -> TickMessages:
-        """Take what is due in the tick of `at_ns`."""
+        """Take the inputs that are due in the tick of `at_ns`."""
         samples: list[PositionSample] = []
         inertial: list[InertialSample] = []
         statuses: list[VehicleStatus] = []

@@ -3,7 +3,7 @@
 The daemon runs it in real time, the simulator in lockstep, and replay from a recording. All
 measurements and decisions go to the sink, in their order.
 
-One tick: 1. gather and record the inputs; 2. send what is due on the connections; 3. run the core (`flight.tick`);
+One tick: 1. gather and record the inputs; 2. send due messages of the connections; 3. run the core (`flight.tick`);
 4. relay positions to the vehicle; 5. update the hand-over; 6. send a setpoint or a request, and answer orders.
 A core that fails is not run again: no setpoint is sent from then on, and the vehicle is asked to land. If the hand-over
 fails, or whole ticks do, a landing request of its own is sent until it is answered.
@@ -302,7 +302,7 @@ class ControlLoop:
     def _update_handover(
         self, inputs: StepInput, output: TickOutput, send: Send, notices: list[Event]
     ) -> tuple[tuple[Command, Event], ...]:
-        """Update the hand-over and send what it allows; return each order with its answer."""
+        """Update the hand-over and send its requests; return each order with its answer."""
         if self._is_handover_failed:
             self._hand_over.update_airborne(inputs.at_ns, self._vehicle)
             self._send_landing_request(inputs.at_ns, send)
@@ -367,7 +367,7 @@ class ControlLoop:
         )
 
     def note_error(self, subject: str, error: Exception, at_ns: int) -> Event:
-        """Note an error of what the flight does not need; return the event."""
+        """Note an error that the flight can do without; return the event."""
         text = f"{subject}: {_describe_error(error)}; the flight goes on"
         return self.handle_failure(InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.NONE), discard)
 
@@ -529,7 +529,7 @@ class ControlLoop:
                 yield event
 
     def _send_commands(self, handover_output: HandoverOutput, output: TickOutput, at_ns: int, send: Send) -> None:
-        """Send the vehicle what the hand-over allows: a setpoint, a request, or nothing."""
+        """Send the vehicle a setpoint, a request, or nothing, as the hand-over allows."""
         link = self._links[VEHICLE]
         is_state_known = self._messages_lost_ns is None
         if is_state_known and handover_output.setpoint_mode is not SetpointMode.NOTHING and output.setpoint is not None:

@@ -116,7 +116,7 @@ class Plan(Record, frozen=True, kw_only=True, eq=False):
     backoff_x: Array  # (H+1, rows of the state set)
     backoff_u: Array  # (H, rows of the input set)
     reference: Vector  # (n_x,), the equilibrium that the plan ends in
-    slack: float  # sum of all state-constraint slacks: what gave way
+    slack: float  # sum of all state-constraint slacks
     offset: float  # l1 distance of the reference from the target
     terminal_miss: float  # l1 violation of the terminal equality (0 unless nothing else was left)
     cost: float
@@ -138,7 +138,7 @@ class Plan(Record, frozen=True, kw_only=True, eq=False):
         return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
 
     def __hash__(self) -> int:
-        """Return a hash of what names a plan."""
+        """Return a hash of the fields that identify a plan."""
         return hash((self.seq, self.base_ns, self.design_id))
 
 
@@ -300,7 +300,7 @@ def raw_topic(link: str, *, outgoing: bool) -> str:
 
 
 class Refused(Record, frozen=True, kw_only=True):
-    """Counts of what a connection dropped unread since the last such record."""
+    """Counts of datagrams that a connection dropped unread since the last such record."""
 
     at_ns: int
     link: str
@@ -403,7 +403,7 @@ class Truth(Record, frozen=True, kw_only=True):
 
 
 class Header(Record, frozen=True, kw_only=True):
-    """First message of a recording: what is needed to decide alike."""
+    """First message of a recording: configuration, design, seed and versions."""
 
     started_ns: int
     started_utc: str
@@ -422,7 +422,7 @@ class Header(Record, frozen=True, kw_only=True):
 
 
 class RiskRecord(Record, frozen=True, kw_only=True):
-    """Risk of the step that ends at a Δt boundary, and what the next plan is made with."""
+    """Risk of the step that ends at a Δt boundary, and level and factors of the next plan."""
 
     age: int  # age of the information that moved the vehicle here [steps], from 1 on
     # Probability that the vehicle is outside of its limits, given all that is known; None while it is not flown
@@ -479,7 +479,7 @@ Send = Callable[[Outgoing], None]
 
 
 def discard(outgoing: Outgoing) -> None:
-    """Take bytes of a loop that nobody listens to, as in a replay; a `Send`."""
+    """Take bytes of a loop without a receiver, as in a replay; a `Send`."""
 
 
 class Received(NamedTuple):
@@ -509,7 +509,7 @@ class Flyer(Protocol):
     """Controller that flies: bytes in, bytes out, time as an argument. The simulator is given one."""
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
-        """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
+        """Take one datagram that arrived at `at_ns`; return its content, and the datagrams to send at once."""
         ...
 
     def tick(self, tick: int, at_ns: int, send: Send) -> object:

@@ -56,7 +56,7 @@ class LiveProcess:
 
     Args:
         port: TCP port; 0 takes one that is free.
-        on_death: Called, from a thread of its own, with the reason and what follows each time that the process ends
+        on_death: Called, from a thread of its own, with the reason and the effect, each time that the process ends
             before `close`.
 
     Attributes:

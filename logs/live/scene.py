@@ -1,4 +1,4 @@
-"""What the live page shows at a moment, and how a flight's records make it."""
+"""Content of the live page at a moment, made from a flight's records."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class LiveServer:
         self._viewers = 0
 
     def publish(self, definition: Definition, at_ns: int, data: bytes) -> None:
-        """Pass a message on to those who have subscribed to its topic."""
+        """Pass a message on to the subscribers of its topic."""
         channel = self._channels.get(definition.topic)
         if channel is None:
             self._definitions.append(definition)

@@ -1,4 +1,4 @@
-"""What a recording carries beside its messages, for other programs: attachments and metadata of MCAP.
+"""Attachments and metadata of a recording, for other programs.
 
 All of it follows from the messages, so that it is written anew for each file and by a recovery, and nothing is decided
 or replayed from it.
@@ -29,7 +29,7 @@ def make_layout_text() -> str:
 
 
 def make_header_attachments(header: Header, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
-    """Return what a header has for other programs: configuration, versions, origin.
+    """Return the parts of a header for other programs: configuration, versions, origin.
 
     Args:
         utc_ns: log time of the header [ns].

@@ -32,11 +32,11 @@ MAX_WHOLE_BYTES = 2**32
 
 
 class ExcessError(Exception):
-    """A record asks for more than is left; says what."""
+    """A record asks for more than the rest of the budget; names it."""
 
 
 class ReadBudget:
-    """What is left for reading one file once.
+    """Rest of the budget for reading one file once.
 
     Args:
         file_bytes: Size of the file.
@@ -88,7 +88,7 @@ class ReadBudget:
             ExcessError: They are too many.
         """
         if length > self._kept_left_bytes:
-            raise ExcessError(f"makes what is read into memory more than {MAX_KEPT_RATIO} times as long as the file")
+            raise ExcessError(f"makes the bytes in memory more than {MAX_KEPT_RATIO} times as long as the file")
         self._kept_left_bytes -= length
 
 

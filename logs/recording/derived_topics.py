@@ -106,7 +106,7 @@ class TimingPlot(Record, frozen=True, kw_only=True):
 
 
 class LinkPlot(Record, frozen=True, kw_only=True):
-    """Estimate of the link that carries the positions, and what the design counts on."""
+    """Estimate of the link that carries the positions, and its design value."""
 
     arrival_mean: float
     arrival_lower: float

@@ -24,7 +24,7 @@ class OutputFile(Protocol):
         ...
 
     def sync(self) -> None:
-        """Wait until the disk has what was written."""
+        """Wait until the disk has all written bytes."""
         ...
 
     def close(self) -> None:
@@ -53,7 +53,7 @@ class DiskFile:
         os.ftruncate(self._fd, size)
 
     def sync(self) -> None:
-        """Wait until the disk has what was written."""
+        """Wait until the disk has all written bytes."""
         os.fsync(self._fd)
 
     def close(self) -> None:

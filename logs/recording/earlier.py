@@ -1,4 +1,4 @@
-"""Records of earlier versions: what a field says today was then part of a text, and is read from there."""
+"""Records of earlier versions: some of today's fields were part of a text, and are read from there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ends of a flight's recording: its path and header; how the flight ended, and what is missing."""
+"""Ends of a flight's recording: its path and header; how the flight ended, and missing records."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def put_header(
     Args:
         started_ns: when it begins, by the flight's clock.
         zero_utc_ns: UTC of time 0 of that clock [ns since 1970]; that of virtual time unless it is given.
-        command: what it was made by; None: the command line of this process.
+        command: command that made it; None: the command line of this process.
     """
     config, design = prepared.config, prepared.design
     header = Header(

@@ -233,7 +233,7 @@ class Exported(msgspec.Struct, frozen=True, kw_only=True):
 
 
 Watch = Callable[[Iterable[RecordedMessage], int | None, str], Iterable[RecordedMessage]]
-"""Looks at messages as they go by, for a progress bar: given them, their number if it is known, and what is done."""
+"""Looks at messages as they go by, for a progress bar: given them, their number if it is known, and the number done."""
 
 
 def ignore_progress(messages: Iterable[RecordedMessage], _total: int | None, _what: str) -> Iterable[RecordedMessage]:

@@ -59,7 +59,7 @@ def detect_kind(path: Path) -> FileKind:
 
 
 def describe_kind_error(path: Path) -> str:
-    """Return what to do with a file that is not of the kind that is asked for, after a semicolon; empty if unknown."""
+    """Return the remedy for a file of another kind, after a semicolon; empty if unknown."""
     begin = _read_head(path)
     other_program_text = next((text for magic, text in _OTHERS.items() if begin.startswith(magic)), "")
     if not other_program_text and path.suffix.lower() == ".bin":

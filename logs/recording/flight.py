@@ -148,7 +148,7 @@ class FlightData:
 
     @cached_property
     def stopped_ns(self) -> int | None:
-        """Return the time at which the operator asked for the hand-over [ns]; None if nobody did."""
+        """Return the time at which the operator asked for the hand-over [ns]; None without a request."""
         return min((inputs.at_ns for inputs in self.step_inputs if inputs.stop), default=None)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Recordings of other programs: `.tlog`, ULog, and MAVLink out of MCAP files, whatever channels hold it.
+"""Recordings of other programs: `.tlog`, ULog, and MAVLink in any channel of MCAP files.
 
 An MCAP has no agreed name for such a topic, nor for its encoding, so the bytes decide:
 
@@ -41,7 +41,7 @@ from uavctl.mavlink.framing import is_frame
 
 @dataclass(frozen=True)
 class FrameStream:
-    """Frames of a stream of bytes, and what was left out of it."""
+    """Frames of a stream of bytes, and counts of its omissions."""
 
     # Its frames in the order of the stream, each at the time of the piece that its last byte came in
     packets: tuple[TlogPacket, ...]
@@ -103,7 +103,7 @@ class _ChannelStream:
         schema: Schema of the channel's messages, if they have one.
         unwrap: Makes a frame of each message, if they are MAVLink wrapped by ROS.
         is_requested: It was asked for, so it is read however little MAVLink is in it.
-        budget: Bounds what is kept.
+        budget: Bounds the kept bytes.
     """
 
     __slots__ = (
@@ -172,7 +172,7 @@ class _ChannelStream:
         return stream.packets, (*notes, *clock.describe_oddities(self.topic))
 
     def describe(self) -> str:
-        """Describe what the channel holds, for an error."""
+        """Describe the content of the channel, for an error."""
         kind = f", {self.kind}" if self.kind else ""
         return f"{self.topic} ({self.encoding or 'no encoding'}{kind}, {self.messages})"
 
@@ -313,7 +313,7 @@ def _format_names(names: list[str]) -> str:
 
 
 def read_foreign_packets(path: Path, topics: Sequence[str] = ()) -> Tlog | None:
-    """Return the MAVLink packets of another program's recording, and what was odd; None if it is of no such kind.
+    """Return the MAVLink packets of another program's recording, and its oddities; None if it is of no such kind.
 
     Args:
         path: The file.

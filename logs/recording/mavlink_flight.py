@@ -1,4 +1,4 @@
-"""A flight as its MAVLink tells it: what was sent and what the vehicle said, out of a `.tlog` of any ground station.
+"""A flight by its MAVLink messages in both directions, out of a `.tlog` of any ground station.
 
 Such a file does not say which way a packet went. The vehicle is the one that is asked for, else the autopilot whose
 heartbeat comes first; what is sent to it comes from anybody else but other vehicles. The clock is that of whoever wrote
@@ -170,7 +170,7 @@ def make_flight(log: Tlog, name: str, system: int | None = None) -> MavlinkFligh
     """Return the flight in some packets.
 
     Args:
-        log: They, and what was odd about them.
+        log: The packets, and their oddities.
         name: Of the recording.
         system: The vehicle's system id; None for the first that is heard.
 
@@ -364,7 +364,7 @@ class _Reader:
             self._vehicle_positions.setdefault(raw.msgname, []).append((at_ns, position_m, None))
 
     def flight(self, name: str, log: Tlog) -> MavlinkFlight:
-        """Return the flight in what was taken."""
+        """Return the flight of the packets so far."""
         beat, attitudes = self._beat, self._attitudes.get(False, self._attitudes.get(True, []))
         own_source = next((own_name for own_name in _OWN if own_name in self._vehicle_positions), "")
         sources = dict(sorted(self._sources.items(), key=lambda item: -len(item[1].track)))

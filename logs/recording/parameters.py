@@ -45,7 +45,7 @@ class VehicleParameter(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParameterReader:
-    """Reader of the parameters in what comes from the vehicle, datagram by datagram."""
+    """Reader of the parameters in the vehicle's datagrams."""
 
     def __init__(self) -> None:
         self._partial_frames: dict[str, bytes] = {}  # of a link: the frame that its last bytes ended in
@@ -57,7 +57,7 @@ class ParameterReader:
         self._autopilots: dict[int, int] = {}  # MAV_AUTOPILOT by system, in the order in which they were heard
 
     def take(self, record: Record) -> None:
-        """Take raw bytes, or what was told before; any other record, and what is sent, says nothing."""
+        """Take raw bytes from the vehicle, or parameters of an earlier record; other records are ignored."""
         if isinstance(record, ToldParameter):
             value = int(record.value) if record.type in _INTEGERS and math.isfinite(record.value) else record.value
             parameter = VehicleParameter(

@@ -106,7 +106,7 @@ def _find_last_note(end: list[RecordedMessage] | None) -> RecorderNote | None:
 
 
 def decode_note(message: RecordedMessage) -> RecorderNote | None:
-    """What the recorder says in a message; None in any other."""
+    """Return the recorder's note in a message; None in any other."""
     if message.definition.topic != RECORDER:
         return None
     note = decode(RECORDER, message.data, message.at_ns)

@@ -1,4 +1,4 @@
-"""Recorder: a bounded queue of records, the messages for viewers made beside them, and notes on what was lost.
+"""Recorder: a bounded queue of records, the messages for viewers made beside them, and notes on losses.
 
 A record that cannot be kept is counted, and the count is part of the recording. While the disk takes nothing, records
 wait in the queue, as long as there is room in it.
@@ -30,7 +30,7 @@ Watcher = Callable[[str, int, bytes], None]
 
 
 class ViewMaker(Protocol):
-    """Interface of what makes messages for viewers, as `logs.recording.views.ViewBuilder`."""
+    """Interface of makers of messages for viewers, as `logs.recording.views.ViewBuilder`."""
 
     def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
         """Return topic and message of all that is derived from a record."""
@@ -38,7 +38,7 @@ class ViewMaker(Protocol):
 
 
 class DerivedTopics:
-    """Derives messages for viewers from records, and passes both on to those who look on.
+    """Derives messages for viewers from records, and passes both on to live viewers.
 
     Args:
         views: makes the messages for viewers; None: there are none.
@@ -167,7 +167,7 @@ class WriteQueue:
             self._dropped += 1
 
     def drain(self, records: int) -> None:
-        """Write up to `records` waiting records and what is derived from them; once a second wait for the disk."""
+        """Write up to `records` waiting records and their messages for viewers; once a second wait for the disk."""
         due = self._clock() >= self._next_look_s
         if due:
             self._next_look_s = self._clock() + LOOK_S
@@ -350,7 +350,7 @@ class _Base:
         self._begin()
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
-        """Queue one value under a topic, or count it as dropped; whatever goes wrong is in `status()`."""
+        """Queue one value under a topic, or count it as dropped; errors are in `status()`."""
         # Each tick comes here after a rest, when nothing of this is in the processor's caches: so it is one function,
         # that looks at little, takes no lock and wakes no thread.
         queue = self._queue
@@ -363,7 +363,7 @@ class _Base:
             self._journal.drop()
 
     def _begin(self) -> None:
-        """Start what runs beside the queue."""
+        """Start the threads and processes beside the queue."""
         return
 
 
@@ -371,7 +371,7 @@ class SyncRecorder(_Base):
     """Recorder that writes in `put`: for virtual time, where the disk may hold up the caller."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
-        """Record one value under a topic; whatever goes wrong is in `status()`."""
+        """Record one value under a topic; errors are in `status()`."""
         super().put(topic, at_ns, record)
         self._journal.drain(self._log.queue)
 

@@ -22,7 +22,7 @@ CHUNK_BYTES = 16384
 
 
 class RecoverResult(msgspec.Struct, frozen=True, kw_only=True):
-    """Numbers of what was restored, and what was lost."""
+    """Numbers of restored and lost messages."""
 
     messages: int  # restored
     messages_lost: int  # by their running numbers; those after the last restored one cannot be known

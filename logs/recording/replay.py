@@ -59,14 +59,14 @@ Leaf = tuple[str, object, object]  # path, recorded, replayed
 
 # What the records of a tick say one after the other: those before the first one that differs are the same.
 _STAGES = {
-    "/uavctl/step_input": "of the same bytes the tick was given something else: parser, clock or frame",
-    "/uavctl/vehicle": "the vehicle's messages are understood otherwise",
-    "/uavctl/estimate": "the tick was given the same: estimator, or how far positions are believed",
-    "/uavctl/link_estimate": "the tick was given the same: what is believed of the link",
+    "/uavctl/step_input": "the same bytes gave other inputs: parser, clock or frame",
+    "/uavctl/vehicle": "the vehicle's messages are read otherwise",
+    "/uavctl/estimate": "the tick was given the same: estimator, or weight of positions",
+    "/uavctl/link_estimate": "the tick was given the same: estimate of the link",
     "/uavctl/plan": "the estimate is the same: design, target or solver",
     DECISION: "estimate and plan (if new) are the same: a rule of the decision, fallback or setpoint limiter",
     "/uavctl/setpoint": "the decision is the same: hand-over or setpoint limiter",
-    "/uavctl/event": "nothing before it differs: what is told",
+    "/uavctl/event": "nothing before it differs: report of an event",
     "/uavctl/link": "nothing before it differs: counters or clock of a connection",
 }
 _SENT = "the decision is the same: hand-over, relay or encoding"
@@ -111,7 +111,7 @@ class Chosen(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Context(msgspec.Struct, frozen=True, kw_only=True):
-    """Tick of the first difference: what came before, its inputs, its decisions."""
+    """Tick of the first difference: records before it, its inputs, its decisions."""
 
     decisions_before: int  # identical ones
     records_before: int  # of those compared, likewise
@@ -236,7 +236,7 @@ def describe_record(record: Record | None) -> str:
 
 
 def read_choice(record: Record | None) -> Chosen | None:
-    """Return what a decision chose."""
+    """Return the choice of a decision."""
     if not isinstance(record, Decision):
         return None
     return Chosen(

@@ -183,7 +183,7 @@ class Segment:
         self._file.close()
 
     def abandon(self) -> None:
-        """After a failed write: cut off what it left behind, end the file as well as there is room, close.
+        """After a failed write: cut off its remains, end the file as well as there is room, close.
 
         Raises:
             OSError: not all of it could be done; the chunks written before are readable all the same.
@@ -425,7 +425,7 @@ class Rotation:
 
     @property
     def has_room(self) -> bool:
-        """Whether a file is open and has not reached its size, not counting what every file begins with."""
+        """Whether a file is open and has not reached its size, not counting the head of each file."""
         segment = self._segment
         if segment is None:
             return False

@@ -1,4 +1,4 @@
-"""Who speaks in a recording of MAVLink, and which of them is the vehicle that it is read for.
+"""Senders in a recording of MAVLink, and the vehicle among them.
 
 A log of a ground station may have several vehicles, and each of them a gimbal, a camera and a companion computer that
 send heartbeats too. Header of a frame: https://mavlink.io/en/guide/serialization.html.
@@ -51,7 +51,7 @@ class ChosenVehicle:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on who else is in the recording, and on what is not known of the vehicle."""
+        """Return sentences on other senders, and on unknown facts of the vehicle."""
         notes = []
         if self.system is not None and self.heartbeat is None:
             notes.append(f"system {self.system} sends no heartbeat of an autopilot: its mode and arming are not known")
@@ -115,7 +115,7 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
 
 
 class SenderCounter:
-    """Counts what each component sent, by the frames that were right."""
+    """Counts the frames of each component."""
 
     def __init__(self) -> None:
         self._last: dict[tuple[int, int], int] = {}
@@ -133,11 +133,11 @@ class SenderCounter:
         self._missing[sender] = self._missing.get(sender, 0) + (skipped if skipped <= _MAX_MISSING else 0)
 
     def take_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Take what a sender says that it is."""
+        """Take the type that a sender reports."""
         self._kinds[heartbeat.system, heartbeat.component] = heartbeat.vehicle_type
 
     def listed(self) -> Iterable[LogSender]:
-        """Return who spoke, by system and component."""
+        """Return the senders, by system and component."""
         for (system, component), messages in sorted(self._messages.items()):
             kind = self._kinds.get((system, component))
             yield LogSender(

@@ -324,7 +324,7 @@ def compute_course_error(flight: FlightData) -> CourseError | None:
 
 
 def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: Flags) -> CourseError | None:
-    """Return what distances come to that count from each arrival on; None without one.
+    """Return the figures of the distances from each arrival on; None without one.
 
     Args:
         t_s: Times (n,) [s].

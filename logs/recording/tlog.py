@@ -86,12 +86,14 @@ class MonotonicClock:
             RecordingError: There are several, and all are zero; or many, and all are the same.
         """
         if self._zeros == self._stamps > 1:
-            raise RecordingError(f"{name}: all {self._stamps} time stamps are zero, so nobody knows what came when")
+            raise RecordingError(
+                f"{name}: all {self._stamps} time stamps are zero, so the times of packets are unknown"
+            )
         if self._same and self._stamps > _MAX_SAME_STAMPS:
             raise RecordingError(f"{name}: all {self._stamps} time stamps are the same, so they tell no time")
 
     def describe_oddities(self, name: str) -> tuple[str, ...]:
-        """Return sentences on what was odd about the stamps."""
+        """Return sentences on oddities of the stamps."""
         notes = []
         if self._jumps:
             notes.append(
@@ -139,7 +141,7 @@ class TlogPacket:
 
 @dataclass(frozen=True)
 class Tlog:
-    """Packets of a `.tlog` in order of time, and what was left out of the file."""
+    """Packets of a `.tlog` in order of time, and counts of the omissions."""
 
     packets: tuple[TlogPacket, ...]
     torn_bytes: int = 0  # of an unfinished packet at the end
@@ -151,7 +153,7 @@ class Tlog:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what was left out, and what was odd about the clock."""
+        """Return sentences on omissions, and on oddities of the clock."""
         notes = list(self.clock_notes)
         if self.skipped_bytes:
             notes.append(f"{count(self.skipped_bytes, 'byte')} between its packets left out: no packet with a stamp")
@@ -179,7 +181,7 @@ def read_tlog(path: Path) -> Tlog:
     if cutter.lacks_stamps():
         raise RecordingError(
             f"{path}: its MAVLink packets have no time stamps (the bytes of a link as they came, like MAVProxy's "
-            ".tlog.raw), so nobody knows what came when; give the .tlog of that flight"
+            ".tlog.raw), so their times are unknown; give the .tlog of that flight"
         )
     if not cutter.packets:
         raise RecordingError(

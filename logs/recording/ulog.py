@@ -153,7 +153,7 @@ def _remove_short_messages(data: bytearray) -> tuple[int, int]:
 
 
 class _Reader:
-    """Reader of what pyulog has parsed."""
+    """Reader of a log that pyulog has parsed."""
 
     def __init__(self, path: Path, log: Any, short: int, torn_bytes: int) -> None:
         self._path, self._log, self._short, self._torn_bytes = path, log, short, torn_bytes
@@ -382,7 +382,7 @@ class _Reader:
         return ""
 
     def _describe_oddities(self) -> Iterator[str]:
-        """Return sentences on what was left out or changed."""
+        """Return sentences on omissions and changes."""
         if dropouts := [dropout.duration for dropout in self._log.dropouts]:
             total_s, longest_s = sum(dropouts) * 1e-3, max(dropouts) * 1e-3
             yield f"{count(len(dropouts), 'dropout')} of the log, {total_s:.2f} s in all, the longest {longest_s:.2f} s"

@@ -58,7 +58,7 @@ def load_flights(
     """Read the recordings of a comparison.
 
     Args:
-        names: What they are called; else A, B, … in their order.
+        names: Names of the flights; else A, B, … in their order.
 
     Raises:
         RecordingError: One cannot be read, or nothing was flown in it; names it.
@@ -361,8 +361,7 @@ def _list_notes(recordings: Sequence[LoadedFlight]) -> Iterator[str]:
             yield f"{recording.identity.name} is torn: compared up to its end"
         if recording.identity.records_lost:
             yield (
-                f"{recording.identity.name} lacks {recording.identity.records_lost} records: what they held is in "
-                f"no figure"
+                f"{recording.identity.name} lacks {recording.identity.records_lost} records: no figure contains them"
             )
     if _differs(recordings, lambda recording: recording.summary.steps):
         yield "the flights are of different length: counts and the cost add up over the steps flown"

@@ -43,7 +43,7 @@ def write_comparison_page(comparison: FlightComparison, recordings: Sequence[Loa
 
 @dataclass(frozen=True, eq=False)
 class ComparisonView:
-    """What the page shows: the comparison, and the flights themselves."""
+    """Content of the page: the comparison, and the flights themselves."""
 
     comparison: FlightComparison
     recordings: Sequence[LoadedFlight]

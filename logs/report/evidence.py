@@ -40,7 +40,7 @@ class Push(NamedTuple):
 
 
 class FlightEvidence:
-    """What the records of a flight show, with its figures and verdicts."""
+    """Records of a flight, with its figures and verdicts."""
 
     def __init__(self, flight: FlightData, summary: FlightSummary, judged: Judgement) -> None:
         self.flight, self.summary, self.judged = flight, summary, judged

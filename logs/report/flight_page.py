@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import sys
 from collections.abc import Iterator
@@ -120,10 +121,12 @@ def _explain_certificates(e: FlightEvidence) -> str:
         else "Slack is the amount by which state limits are relaxed where no plan keeps them all. No flown plan "
         "relaxed a constraint."
     )
-    return (
-        "Each plan has a lower bound of the optimal cost: the gap between cost and bound is certified. "
-        f"{plan_figures.describe_methods(e.flight)}{slack_text}"
+    bound_text = (
+        "Plans have a lower bound of the optimal cost: the gap between cost and bound is certified. "
+        if any(math.isfinite(plan.gap) for plan in e.flight.plans)
+        else ""
     )
+    return f"{bound_text}{plan_figures.describe_methods(e.flight)}{slack_text}"
 
 
 def _explain_timing(e: FlightEvidence) -> str:
@@ -245,7 +248,7 @@ SECTIONS: tuple[PageSection[FlightEvidence], ...] = (
         lambda e: plan_figures.draw_certificates(e.flight),
         note=_explain_certificates,
         legend=lambda e: (Mark("dot", role, name) for name, role in plan_figures.list_methods(e.flight)),
-        empty_text=_NO_PLAN,
+        empty_text="No plan has a certified gap, and no flown plan has slack.",
         is_closed=True,
     ),
     PageSection(

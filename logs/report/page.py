@@ -1,4 +1,4 @@
-"""Kit of all pages: a page is a list of sections, each a title, what it shows, and when.
+"""Kit of all pages: a page is a list of sections, each a title, its content, and a condition.
 
 A page is one HTML file with nothing from outside, whole without its script, too.
 """
@@ -49,7 +49,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class PageSection(Generic[View]):
-    """One row of a page's list: a title, what stands below it, and when the page has it.
+    """One row of a page's list: a title, its content, and a condition.
 
     Attributes:
         title: Heading.
@@ -105,7 +105,7 @@ def _fill_sections(sections: Iterable[PageSection[View]], view: View) -> Iterato
 
 @cache
 def _load_macros() -> jinja2.Environment:
-    """Return the environment of the page's macros: whatever is not marked as HTML is escaped."""
+    """Return the environment of the page's macros: text that is not marked as HTML is escaped."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("logs.report", "."),
         autoescape=True,
@@ -167,7 +167,7 @@ def _render_grid(drawings: Sequence[Drawing]) -> Markup:
 
 
 def _add_label(drawing: Drawing) -> Markup:
-    """Return a drawing with its description for those who do not see it."""
+    """Return a drawing with its description for screen readers."""
     return Markup(drawing.svg.replace("<svg ", f'<svg role="img" aria-label="{escape(drawing.label)}" ', 1))
 
 

@@ -333,7 +333,7 @@ def draw_plans_against_flown(flight: FlightData) -> Iterator[Drawing]:
             ax.plot(*thin_samples(t_s[is_shown], values[is_shown]), color=colour("truth"), lw=1.5, zorder=4)
             ax.set_xlim(0, end_s)
         yield Drawing(
-            key, canvas.svg, f"{name.capitalize()}: {len(plans)} plans with their back-off against what was flown"
+            key, canvas.svg, f"{name.capitalize()}: {len(plans)} plans with their back-off against the flown path"
         )
 
 
@@ -350,7 +350,7 @@ def _draw_plans_above(flight: FlightData, plans: list[Plan], end_s: float) -> Dr
             ax.plot(east[0], north[0], "o", ms=4.5, color=colour("plan"), zorder=5)
         ax.plot(flown[:, 1], flown[:, 0], color=colour("truth"), lw=1.5, zorder=4)
         ax.set_aspect("equal", adjustable="datalim")
-    return Drawing("plan-above", canvas.svg, f"{len(plans)} plans against what was flown, seen from above")
+    return Drawing("plan-above", canvas.svg, f"{len(plans)} plans against the flown path, seen from above")
 
 
 def get_positions(flight: FlightData) -> tuple[Array, Array]:

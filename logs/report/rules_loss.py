@@ -27,7 +27,7 @@ _SLIGHT_M = 0.02  # beyond a wall: within the error of camera and estimator
 
 
 def describe_depth(e: FlightEvidence, excursion: Excursion) -> str:
-    """Return how far beyond a limit it was; a fall ends at the floor, whatever the estimate."""
+    """Return how far beyond a limit it was; a fall ends at the floor."""
     is_estimated = not e.flight.truths
     return (
         "down to the floor"

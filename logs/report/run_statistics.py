@@ -48,7 +48,7 @@ def clopper_pearson(hits: int, trials: int, level: float = RUNS_LEVEL) -> Interv
 
     Args:
         hits: Number of independent trials in which it happened.
-        level: Confidence that it covers the probability at least, whatever that is.
+        level: Confidence that it covers the probability, at least.
 
     Raises:
         UsageError: There are no trials, or more hits than trials.

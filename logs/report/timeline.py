@@ -87,7 +87,7 @@ def draw_timeline(flight: FlightData) -> Iterator[Drawing]:
 
 def describe_lanes(flight: FlightData) -> str:
     """Return a sentence on the meaning of each lane."""
-    return f"What a lane shows: {'; '.join(f'“{lane.name}”: {lane.meaning}' for lane in make_lanes(flight))}."
+    return f"Content of a lane: {'; '.join(f'“{lane.name}”: {lane.meaning}' for lane in make_lanes(flight))}."
 
 
 def _find_silent_steps(flight: FlightData) -> Iterator[Decision]:

@@ -42,7 +42,7 @@ def judge_room(flight: FlightData, promised: str | None = None) -> RoomVerdict:
     out.
 
     Args:
-        promised: What rehearsed flights did, in words.
+        promised: Result of the rehearsed flights, in words.
     """
     design, steps = flight.design, flight.steps
     index, box = list(design.position_index), design.state_box

@@ -43,7 +43,7 @@ def judge_flight(flight: FlightData, promised: str | None = None) -> Judgement:
     """Judge a flight by its records.
 
     Args:
-        promised: What rehearsed flights did, in words; see `judge_room`.
+        promised: Result of the rehearsed flights, in words; see `judge_room`.
     """
     config = read_flown_config(flight)
     samples = None if config is None else compute_innovations(flight, config)

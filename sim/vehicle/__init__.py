@@ -1,1 +1,1 @@
-"""What flies in the simulator: the linear plant and a quadrotor with its loops."""
+"""Simulated vehicles: the linear plant and a quadrotor with its loops."""

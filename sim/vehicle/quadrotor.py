@@ -82,7 +82,7 @@ class Quadrotor:
 
     @property
     def has_down(self) -> bool:
-        """Whether it can climb and descend: always, whatever the controller's plant has."""
+        """Whether it can climb and descend: always, also with a plant without this axis."""
         return True
 
     @property
@@ -147,7 +147,7 @@ class Quadrotor:
 
     @property
     def state(self) -> Array:
-        """State x (n_x,) of the controller's plant: positions, velocities, and what thrust and gravity accelerate."""
+        """State x (n_x,) of the controller's plant: positions, velocities, acceleration by thrust and gravity."""
         x = np.zeros(self.model.a.shape[0])
         position, velocity, thrust_accel = self.position_m, self.velocity_mps, self._compute_thrust_accel()
         for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
@@ -162,7 +162,7 @@ class Quadrotor:
         return np.array([self._accel[axis] for axis in self.model.axes]) / self.model.accel_per_input
 
     def _compute_thrust_accel(self) -> Vec3:
-        """Return the acceleration by thrust and gravity alone [m/s²]: what the input does in the plant."""
+        """Return the acceleration by thrust and gravity alone [m/s²]: the effect of the input in the plant."""
         if self._touched_ns is not None or self._grounded:
             return ZERO
         w, x, y, z = self._motion.attitude

@@ -276,7 +276,7 @@ def make_cell(config: Config, kind: str, **spec: object) -> tuple[Recipe, CellSe
     try:
         campaign = msgspec.convert(document, CampaignSpec)
     except msgspec.ValidationError as error:
-        raise UsageError(f"{error}; docs/campaign-keys.md says what is possible") from error
+        raise UsageError(f"{error}; docs/campaign-keys.md lists the keys") from error
     problems = tuple(
         f"{problem.key}: {problem.reason}; load it with {problem.todo}"
         for problem in find_plant_problems(config, (), "config")
@@ -400,13 +400,13 @@ def simulate(
     """Fly many runs of a controller, as one cell of `uavctl campaign` does.
 
     Args:
-        config: Plant, link, limits, costs and target; what the controller believes, too.
+        config: Plant, link, limits, costs and target; also of the controller's model.
         controller: `smpc`, a baseline (`lqg`, `mean-qp` …), an entry point, or `module:Class`.
         runs: N.
         steps: T.
-        seed: Run i's draws come from (seed, i), whatever the controller.
+        seed: Run i's draws come from (seed, i), for each controller.
         start: State in which every run starts (n_x,); None: that of `[sim]`.
-        measured: What a packet tells: the exact `state`, or a noisy `position` that a filter reads.
+        measured: Content of a packet: the exact `state`, or a noisy `position` that a filter reads.
 
     Raises:
         ConfigError: The configuration is wrong, or not one of campaigns.

@@ -248,7 +248,7 @@ def plot(what: SolvedPlan | Runs | Flight | Recording) -> Figure:
     elif isinstance(what, Recording):
         _draw_path(figure, what)
     else:
-        raise UsageError(f"a {type(what).__name__} has no figure; give what solve, simulate, fly or read returned")
+        raise UsageError(f"a {type(what).__name__} has no figure; give a result of solve, simulate, fly or read")
     return figure
 
 

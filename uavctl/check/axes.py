@@ -168,7 +168,7 @@ def _format_vector(vector: Array) -> str:
 
 
 def _make_hint(evidence: list[Evidence], config: Config) -> str:
-    hint = "see [frame] (convention, origin_m, yaw_deg), and the unit and handedness of what the source sends"
+    hint = "see [frame] (convention, origin_m, yaw_deg), and the unit and handedness of the source's positions"
     if uses_camera_system(config):
         hint = CAMERA_AXES
     is_only_rest = len(evidence) == 1 and config.check.same_origin

@@ -247,7 +247,7 @@ ARDUPILOT = (
     Rule("COMPASS_USE", "Set it to 0. Arming checks a compass that is not used.", _judge_compass),
     Rule(
         "FS_EKF_ACTION",
-        "Set it to 1. Otherwise a vehicle without positions stays in GUIDED and drifts, whatever GUID_TIMEOUT is.",
+        "Set it to 1. Otherwise a vehicle without positions stays in GUIDED and drifts, despite a short GUID_TIMEOUT.",
         _judge_copter_failsafe,
     ),
     Rule(

@@ -268,7 +268,7 @@ def render_solution(answer: Answer, design: AnyDesign, config: Config, solve_us:
     """Return the plan as a table with its largest back-offs, a row for each stage."""
     head = f"{config.name}, method {answer.method}: {answer.status.value} in {solve_us / 1000:.1f} ms"
     if not answer.inputs.size:
-        hint = "is the state far beyond what numbers can hold? Give one nearer to the limits"
+        hint = "is the state too large to compute with? Give one nearer to the limits"
         if config.solver.method == "printed":
             hint = "the printed problem has hard limits; `exact` softens those of the state"
         return f"{head}; no plan: {hint}"

@@ -120,7 +120,7 @@ def _write_all(descriptor: int, data: bytes) -> bool:
 
 
 def prepare_streams() -> None:
-    """Prepare the standard streams of this process, whatever it was started with.
+    """Prepare the standard streams of this process, also closed ones.
 
     1. Open a closed standard stream on the null device: else the next file that is opened would take its number.
     2. Let standard output write characters that its encoding lacks as escapes.
@@ -158,14 +158,14 @@ def limit_output_wait() -> Iterator[None]:
         yield
     except (BrokenPipeError, TimeoutError) as error:
         discard_output()
-        raise OutputError("standard output: nobody reads it") from error
+        raise OutputError("standard output: it has no reader") from error
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL if previous is None else previous)
 
 
 def discard_output() -> None:
-    """Discard what standard output holds, and all that is written to it from now on."""
+    """Discard the buffer of standard output, and all that is written to it from now on."""
     with suppress(OSError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, 1)

@@ -138,7 +138,7 @@ def print_warning(text: str) -> None:
 
 
 def report_dead_view(reason: str) -> None:
-    """Print that the process of a live view has ended, and what follows."""
+    """Print that the process of a live view has ended, and the effect."""
     print_message(label_text("warning", f"the live view has ended: {reason}; the flight goes on"))
 
 
@@ -226,7 +226,7 @@ def wait_for_server(stopped: Callable[[], bool]) -> Callable[[str], bool]:
     def wait(url: str) -> bool:
         if url not in reported_urls:
             reported_urls.add(url)
-            print_message(f"waiting for {url}, where nobody listens yet; Ctrl-C ends it")
+            print_message(f"waiting for {url}, where no server listens yet; Ctrl-C ends it")
         until_s = time.monotonic() + SERVER_RETRY_S
         while time.monotonic() < until_s and not stopped():
             time.sleep(0.05)

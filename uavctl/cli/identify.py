@@ -31,7 +31,7 @@ from uavctl.wiring.controller import build_flight_design
 
 def identify_command(
     flight: Annotated[
-        Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog", validator=check_readable)
+        Path, Parameter(help="the recording: a flight.mcap, or another program's .tlog", validator=check_readable)
     ],
     /,
     *,
@@ -42,7 +42,7 @@ def identify_command(
     """Identify the vehicle and the link of a flight, and write them as a configuration with a page of plots.
 
     A recording of ours brings its configuration along; for a `.tlog`, --config and --set define which messages are
-    positions and in what frame. Plant, link, rate and noise of that configuration are replaced, all else is kept.
+    positions, and their frame. Plant, link, rate and noise of that configuration are replaced.
     """
     history, config = _read_history(flight, common, system)
     target = out if out is not None else flight.with_name("identified.toml")
@@ -87,7 +87,7 @@ def _read_history(flight: Path, common: Common, system: int | None) -> tuple[Fli
         raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
     config = parse_recorded(read_header(flight).config_toml, f"{flight} (configuration)").config
     if cut := explain_missing_end(flight):
-        warn(f"{cut}: identified from what comes before")
+        warn(f"{cut}: identified from the part before")
     return read_recorded_history(read(flight)), config
 
 

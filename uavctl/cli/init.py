@@ -71,7 +71,7 @@ mocap = "udpin://0.0.0.0:14560"
 
 def init(
     *,
-    autopilot: Annotated[Literal["px4", "ardupilot"], Parameter(help="what the vehicle flies under")] = "px4",
+    autopilot: Annotated[Literal["px4", "ardupilot"], Parameter(help="autopilot of the vehicle")] = "px4",
     room: Annotated[
         str,
         Parameter(

@@ -195,18 +195,14 @@ log_app = App(
 _COMMANDS = {
     "replay": (
         "replay:replay",
-        """Drive the recorded inputs through the same control loop and compare all that it decides.
+        """Drive the recorded inputs through the same control loop and compare all decisions.
 
         Another program's flight (a `.tlog`, or an MCAP with raw MAVLink in it) goes through parser, clock offset,
         estimator and controller of `--config`. With `--set KEY=VALUE` a recording of ours is replayed with that key
-        changed: what the changed controller would have decided of the same inputs, from the first decision that
-        differs on.
+        changed: the output shows the first decision that differs on the same inputs.
         """,
     ),
-    "report": (
-        "log_report:report",
-        "Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else.",
-    ),
+    "report": ("log_report:report", "Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file."),
     "compare": (
         "log_report:compare_command",
         "Compare flights: parameters that differ, figures, and the first difference.",
@@ -215,8 +211,8 @@ _COMMANDS = {
         "whatif:whatif",
         """Fly a recorded flight again with something changed, in the same disturbance, and compare.
 
-        The recorded inputs of the control loop come again at their times; positions are moved by as much as the
-        vehicle, by its model, would have been elsewhere. docs/what-if.md shows its limits.
+        The recorded inputs of the control loop are given again at their times; positions are moved by the difference
+        of the two flights, by the model. docs/what-if.md shows the limits.
         """,
     ),
     "export": (

@@ -125,7 +125,7 @@ def report(
 ) -> int:
     """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else.
 
-    The page has the probability that such a flight leaves the room, by rehearsals, beside what this flight did.
+    The page has the probability that such a flight leaves the room, by rehearsals, beside the observed share.
     """
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):

@@ -203,7 +203,7 @@ def _make_design_table(tried: list[TriedDesign]) -> Table:
         )
         for design in tried
     )
-    return make_table("Schedules, and what comes of them", headings, rows, headings)
+    return make_table("Schedules and their designs", headings, rows, headings)
 
 
 def _make_complexity_table(sizes: list[Complexity]) -> Table:

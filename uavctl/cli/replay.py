@@ -65,9 +65,9 @@ def _list_warnings(replayed: ReplayOutcome) -> Iterator[str]:
     result = replayed.result
     yield from (f"{text}: decisions may differ" for text in replayed.other_versions)
     if result.dropped:
-        yield f"{count(result.dropped, 'record')} missing in the recording: what came after cannot be compared"
+        yield f"{count(result.dropped, 'record')} missing in the recording: later ones cannot be compared"
     if replayed.holes:
-        yield f"{replayed.holes}: where messages are missing, what came after cannot be compared"
+        yield f"{replayed.holes}: after missing messages nothing can be compared"
     if replayed.lacks_end:
         compared = "compared up to there" if result.decisions else "before its first decision, so nothing was compared"
         yield f"{replayed.lacks_end}: {compared}"

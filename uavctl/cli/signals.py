@@ -58,7 +58,7 @@ def handle_end_signals(handler: Handler) -> Iterator[None]:
 
 @contextmanager
 def ignore_stopping_signals() -> Iterator[None]:
-    """Ignore Ctrl-Z, and what stops a process in the background that reads or writes its terminal."""
+    """Ignore Ctrl-Z, and the signals that stop a background process at its terminal."""
     previous = {number: signal.signal(number, signal.SIG_IGN) for number in _STOPPING}
     try:
         yield

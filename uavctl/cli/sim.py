@@ -68,12 +68,12 @@ def sim(
         Parameter(help="simulated time per real time, at most 1000", validator=validators.Number(gt=0, lte=MAX_SPEED)),
     ] = 1.0,
     faults: Annotated[
-        Path | None, Parameter(help="TOML file of what happens, as [[fault]] tables with the keys of [[sim.fault]]")
+        Path | None, Parameter(help="TOML file of faults: [[fault]] tables with the keys of [[sim.fault]]")
     ] = None,
     vehicles: Annotated[
         int,
         Parameter(
-            help="how many at once, 1 to 10. Each has the system id and the seed of the one before plus one, starts "
+            help="number of vehicles, 1 to 10. Each has the system id and the seed of the one before plus one, starts "
             "1 m from it, and its ports lie 1 (UDP) or 10 (TCP) higher",
             validator=validators.Number(gte=1, lte=MAX_VEHICLES),
         ),
@@ -81,8 +81,7 @@ def sim(
     view: Annotated[
         bool,
         Parameter(
-            negative=(),
-            help="show what happens on standard error, without a terminal a line a second, and in a browser",
+            negative=(), help="show the flight on standard error (without a terminal a line a second), and in a browser"
         ),
     ] = False,
 ) -> int:

@@ -71,9 +71,9 @@ def tune(
     """Excite the vehicle inside a box, identify it, write a tuned configuration, fly again, and compare.
 
     The pilot's stick ends a flight at any time, and the pilot keeps the vehicle; Ctrl-C brakes and lands. Either way
-    the same command goes on later. Without --arm the pilot arms, takes off and switches.
+    the same command continues later. Without --arm the pilot arms, takes off and switches.
 
-    Exit codes: 0 done; 1 a flight went otherwise, or shows too little; 2 what was asked for cannot be; 4 the pilot has
+    Exit codes: 0 done; 1 a flight ended early, or shows too little; 2 box, folder or options are wrong; 4 the pilot has
     taken over; 130 interrupted.
     """
     take_off_m = check_take_off(arm, takeoff)
@@ -102,7 +102,7 @@ def tune(
     result = run_tuning(request)
     if result.stopped:
         print_message(label_text("stopped", result.stopped, "bold yellow"))
-        print_message(f"Go on with the same command; what is done stays in {folder}.")
+        print_message(f"Continue with the same command; complete steps stay in {folder}.")
     document = {field.name: msgspec.to_builtins(getattr(result, field.name)) for field in dataclasses.fields(result)}
     common.show("tune", document, lambda: Group(*_render(result)))
     return result.exit_code

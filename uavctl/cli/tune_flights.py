@@ -160,7 +160,7 @@ def measure_position(config: Config) -> Vec3:
             due = ticker.next()
     if not samples:
         raise NotReachedError(
-            f"no position came within {LISTEN_S:g} s, so nobody knows whether the vehicle stands in the box; "
+            f"no position came within {LISTEN_S:g} s, so the vehicle may stand outside the box; "
             "check the cameras (`uavctl check`)"
         )
     ((source, _),) = Counter(sample.source for sample in samples).most_common(1)

@@ -62,7 +62,7 @@ class TuneStoppedError(Exception):
 
 @dataclass(frozen=True)
 class TuneRequest:
-    """What a run flies, and where."""
+    """Request for a run: configuration, mission, box and folder."""
 
     config: Config  # the configuration to tune
     mission: Config  # the same with the mission of both flights
@@ -76,7 +76,7 @@ class TuneRequest:
 
 @dataclass
 class TuneResult:
-    """What a run has so far; empty and None for steps that are still to come."""
+    """Result of a run; empty and None for steps that are still to come."""
 
     before: str = ""  # recordings
     after: str = ""
@@ -138,7 +138,7 @@ def _take_steps(request: TuneRequest, result: TuneResult) -> None:
 def _write_tuned(request: TuneRequest, recording: Path) -> tuple[Change, ...]:
     """Identify a flight, and write the tuned configuration; return its changes."""
     if cut := explain_missing_end(recording):
-        warn(f"{cut}: identified from what comes before")
+        warn(f"{cut}: identified from the part before")
     history = read_recorded_history(read(recording))
     with show_fit_progress(count_fits(history, request.config)) as advance:
         identification = identify(history, request.config, advance)

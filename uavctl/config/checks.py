@@ -481,7 +481,7 @@ def _check_bias(plant: PlantConfig, sets: SetsConfig, estimator: EstimatorConfig
     if plant.model == "velocity-reference" and estimator.bias_drift:
         yield ConfigProblem(
             "estimator.bias_drift",
-            'an unknown part of the input is not what disturbs model "velocity-reference": its loops hold it',
+            'an unknown part of the input does not disturb model "velocity-reference": its loops hold it',
             "set bias_drift and bias_max to 0, and plant.force_drift_mps2_rts in their place",
         )
     if (estimator.bias_drift > 0.0) != (estimator.bias_max > 0.0):

@@ -93,7 +93,7 @@ def find_excess(text: str) -> tuple[int, str] | None:
 
 
 def _describe_long_token(text: str) -> str:
-    """What is wrong with a string, or with keys and numbers between marks, if one is too long; else empty.
+    """Return the problem of a string, key or number that is too long; else empty.
 
     A parser takes some 150 bytes of memory for each character of a number or a text.
     """

@@ -615,7 +615,7 @@ def read_document(section: type[D], path: Path) -> tuple[D | None, Source, list[
 
 
 FaultCheck = Callable[[Literal["px4", "ardupilot"], Sequence[FaultConfig], str], Iterable[ConfigProblem]]
-_Faults = Annotated[tuple[FaultConfig, ...], declare("what happens in the course of a flight", length=MAX_FAULTS)]
+_Faults = Annotated[tuple[FaultConfig, ...], declare("faults in the course of a flight", length=MAX_FAULTS)]
 
 
 class _FaultFile(Section, frozen=True, kw_only=True):

@@ -158,7 +158,7 @@ class StatedColumn(NamedTuple):
 
 
 def parse_heading(cell: str) -> tuple[str, float, str] | None:
-    """What a heading names: `t`, `x`, `vx` …, its sign, and its unit (empty where it states none); None if nothing."""
+    """Return the quantity of a heading (`t`, `x`, `vx` …), its sign and its unit, or empty; None for no quantity."""
     match = _HEADING.fullmatch(cell.strip(" \"'").lower())
     if match is None:
         return None

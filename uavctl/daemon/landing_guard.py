@@ -29,7 +29,7 @@ SIGN_OF_LIFE, END = b".", b"end"
 
 
 class LandingFrames(msgspec.Struct, frozen=True, array_like=True):
-    """What the process needs to land the vehicle; without frames it is not to."""
+    """Data that the process needs to land the vehicle; without frames it does not."""
 
     requests: tuple[tuple[bytes, ...], ...] = ()  # frames of each request in turn; the last ones repeat
     vehicle: tuple[int, int] = (0, 0)  # its system and component

@@ -107,7 +107,7 @@ def _lock_memory() -> RealtimeSetting:
         return RealtimeSetting(
             "memory", False, f"cannot be locked ({reason}) and may be paged out; is this Linux 4.4 or later?"
         )
-    return RealtimeSetting("memory", True, "locked: what was touched once is never paged out")
+    return RealtimeSetting("memory", True, "locked: used pages stay in memory")
 
 
 def _may_lock_memory() -> bool:

@@ -1,8 +1,8 @@
-"""Context of a tick: what all its phases know, and what they see of the filter.
+"""Context of a tick: data of all phases, and their view of the filter.
 
 1. `locate_on_grid` finds the place of a tick on the Δt grid. Tick n is at n · tick, step k = n // (Δt / tick).
 2. `view_filter` predicts the estimate for the tick, and finds the age of the newest position.
-3. `observe_motion` puts together what monitors compare.
+3. `observe_motion` makes the observation for the monitors.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def observe_motion(
     is_braking: bool = False,
     inertial_mps2: Vec3 | None = None,
 ) -> Observation:
-    """Put together what monitors compare."""
+    """Make the observation for the monitors."""
     position, velocity, plant = None, (math.nan, math.nan, math.nan), context.controller.plant
     if estimate is not None:
         position = expand_axes(plant, estimate.mean, plant.position_index, math.nan)

@@ -65,7 +65,7 @@ _FINAL_TEXTS = {
 
 
 class Decided(msgspec.Struct, frozen=True, eq=False):
-    """Result of phase 4: what flies, with the reason."""
+    """Result of phase 4: mode and input, with the reason."""
 
     plan: Plan | None
     superseded_after_ns: int | None  # a position that was captured after this time supersedes the plan
@@ -91,7 +91,7 @@ class Decided(msgspec.Struct, frozen=True, eq=False):
 
 
 class _Phase(msgspec.Struct, frozen=True, eq=False):
-    """What the steps of this phase know."""
+    """Data of the steps of this phase."""
 
     state: ControlState
     context: TickContext
@@ -107,14 +107,14 @@ class _Phase(msgspec.Struct, frozen=True, eq=False):
 
 
 def decide(state: ControlState, context: TickContext, supervised: Supervised, ordered: Ordered) -> Decided:
-    """Decide what flies: nothing yet, the plan, or the fallback."""
+    """Decide the mode: wait, plan, or fallback."""
     phase = _Phase(state, context, supervised)
     draft = _apply_requests(phase, ordered)
     return _decide_handed_over(draft, phase) or _decide_fallback(draft, phase) or _decide_plan(draft, phase)
 
 
 def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
-    """Apply what orders, monitors and the operator's stop have changed."""
+    """Apply the changes by orders, monitors and the operator's stop."""
     state, supervised, at_ns = phase.state, phase.supervised, phase.context.at_ns
     fallback = ordered.fallback
     for reason in supervised.fallback_reasons:
@@ -289,7 +289,7 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
 
 
 def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phase) -> Preview:
-    """Add what the solver has to know of the estimate and of the last input."""
+    """Add data of the estimate and the last input to the question."""
     controller = phase.controller
     # u = u_sent + d: the solver counts what acts on the plant in all
     sent = controller.plant.to_input(phase.state.plan.sent_mps2)

@@ -152,7 +152,7 @@ def insert_sample(
     """Sort a sample in; return too the reason if it is refused.
 
     Args:
-        belief: What `predict_belief` gives at its capture time, if that is known.
+        belief: Result of `predict_belief` at its capture time, if that is known.
     """
     key = (read_capture_ns(sample), _SAMPLE, sample.source, sample.captured_ns)
     if key[0] <= history.window_begin_ns:
@@ -263,7 +263,7 @@ def note_input(history: FilterHistory, at_ns: int, u: Array | None, belief: Beli
     Args:
         at_ns: Time now [ns]; it never goes back, and nothing that is known is later.
         u: The input (n_u,); None: others fly.
-        belief: What `predict_belief` gives at `at_ns`, if that has been asked.
+        belief: Result of `predict_belief` at `at_ns`, if that is known.
     """
     before = _find_newest_input(history)
     if before is u or (before is not None and u is not None and before.tolist() == u.tolist()):

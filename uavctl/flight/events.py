@@ -81,7 +81,7 @@ def report_events(
     ordered: Ordered,
     decided: Decided,
 ) -> Reported:
-    """Report what has changed in a tick."""
+    """Report the changes of a tick."""
     before, at_ns = state.alarms, context.at_ns
     counts, link = _count_link(before.link, context, supervised)
     spread = measured.samples.sources.spread.spread
@@ -149,7 +149,7 @@ def _report_delay(before: SmoothingTrack, now: SmoothingTrack, at_ns: int) -> It
 
 
 def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -> Iterable[Event]:
-    """Report trouble of the solver, limits that gave way, a change of mode, and the end of the mission."""
+    """Report trouble of the solver, relaxed limits, a change of mode, and the end of the mission."""
     at_ns, plan, mode = context.at_ns, decided.new_plan, decided.mode
     if decided.solve is not None and decided.trouble:
         yield _make_event(at_ns, Severity.WARNING, EventCode(f"solve-{decided.solve.value}"), decided.trouble)

@@ -127,7 +127,7 @@ def advance_fallback(
         at_ns: Time of this tick [ns].
         speed_mps: Speed now [m/s]; NaN counts as moving.
         sent_mps2: The setpoint of the tick before [m/s²].
-        hold_accel_mps2: What HOLD sends [m/s²].
+        hold_accel_mps2: Acceleration of HOLD [m/s²].
         is_measured: Whether the speed is the vehicle's own velocity, not a prediction.
         is_open_loop: Whether it is a prediction that no recent position, and no inertial data, carry on.
         is_blind: Whether it is a prediction without a recent position: nothing shows a drift.

@@ -38,7 +38,7 @@ RELEARN_STD_MPS = 0.2  # standard deviation of a velocity error that inertial da
 
 @dataclass(frozen=True)
 class EstimatorParameters:
-    """Parameters of the estimator: what it assumes of samples, biases and inertial data."""
+    """Parameters of the estimator: its assumptions on samples, biases and inertial data."""
 
     position_std_m: float  # least standard deviation of a position sample, each axis [m]; a sample may claim more
     velocity_std_mps: float  # standard deviation of a velocity sample, each axis [m/s]
@@ -93,7 +93,7 @@ class Kalman:
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):
-    """Gaussian of z = (x, w) at `at_ns`, and what went into it."""
+    """Gaussian of z = (x, w) at `at_ns`, and its sources."""
 
     at_ns: int  # time [ns]
     captured_ns: int  # capture time of the newest sample in it [ns]
@@ -103,7 +103,7 @@ class Belief(msgspec.Struct, frozen=True, eq=False):
 
 
 def make_model(plant: Plant, parameters: EstimatorParameters) -> Plant:
-    """Make the plant that the filter estimates: x, and behind it the biases d and what inertial data are off, b."""
+    """Make the plant that the filter estimates: x, then the biases d, and the bias b of inertial data."""
     uses_inertial = parameters.inertial_std_mps2 > 0.0
     model = add_bias(plant, parameters.bias_drift, force=uses_inertial) if parameters.bias_drift else plant
     if not uses_inertial:
@@ -192,7 +192,7 @@ def read_capture_ns(sample: PositionSample) -> int:
 
 
 def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_ns: int) -> Belief:
-    """Predict a belief for `at_ns`. The grid's boundaries cut the time at the same places whatever came in.
+    """Predict a belief for `at_ns`. The grid's boundaries always cut the time at the same places.
 
     Args:
         origin_ns: A boundary of the grid [ns].

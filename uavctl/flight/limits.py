@@ -1,4 +1,4 @@
-"""Setpoint limiter: any acceleration becomes finite, bounded and slew-limited, whatever has asked for it.
+"""Setpoint limiter: any acceleration becomes finite, bounded and slew-limited.
 
 A multicopter tilts by φ with tan φ = |a_h| / (g - a_down). A largest tilt couples the horizontal axes: the cone
 |a_h| <= (g - a_down) tan φ_max. Plans keep the largest box inside of it that is alike for both axes, so each axis has
@@ -46,12 +46,12 @@ def limit_setpoint(
     """Make any acceleration safe to send.
 
     Args:
-        want_mps2: What is asked for, north, east, down [m/s²]; any floats, NaN and infinity too.
-        previous_mps2: What was sent last [m/s²]; taken as within the limits (zero where it is not finite).
+        want_mps2: Wanted acceleration north, east, down [m/s²]; any floats, NaN and infinity too.
+        previous_mps2: Last setpoint [m/s²]; taken as within the limits (zero where it is not finite).
         tick_s: Time since then [s].
 
     Returns:
-        The acceleration to send, and the names of what was changed ("non-finite", "clamp-north", "slew-down", "tilt").
+        The acceleration to send, and the names of the changes ("non-finite", "clamp-north", "slew-down", "tilt").
     """
     limited: list[str] = []
     if not all(map(math.isfinite, want_mps2)):

@@ -297,7 +297,7 @@ def _judge_sample(
     corrected: PositionSample,
     belief: Belief,
 ) -> tuple[SourceHealth, Verdict]:
-    """Compare a sample with what is known.
+    """Compare a sample with the prediction and earlier samples.
 
     Args:
         sample: The sample as it came.

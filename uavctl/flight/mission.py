@@ -231,7 +231,7 @@ def find_target(mission: Mission, state: MissionState, at_ns: int) -> Vector:
 
 
 def make_question(mission: Mission, state: MissionState, at_ns: int) -> tuple[Array, Preview]:
-    """Make the question for a plan that begins at a boundary: the target (n_x,), and what is known ahead."""
+    """Make the question for a plan that begins at a boundary: the target (n_x,), and the known course ahead."""
     limits = _compute_limits(mission, at_ns - state.start_ns + mission.dead_ns)
     if state.lead is not None and is_led(mission, state, at_ns):
         return np.array(state.lead.leading_target), Preview(limits=limits)

@@ -100,7 +100,7 @@ class FallbackGroup(msgspec.Struct, frozen=True, eq=False):
 
 
 class AlarmGroup(msgspec.Struct, frozen=True):
-    """State of what is reported to people once."""
+    """State of reports that people get once."""
 
     link: LinkCounts = NO_COUNTS  # counts of the link at the boundaries so far
     link_alarms: tuple[str, ...] = ()  # alarms of the link that were reported and still hold, by event code
@@ -127,7 +127,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
 
 
 def find_mode(plan: Plan | None, fallback: Fallback | None) -> ControlMode:
-    """Find the control mode of what flies."""
+    """Find the control mode."""
     if fallback is not None:
         return fallback.mode
     return ControlMode.WAIT if plan is None else ControlMode.TRACK

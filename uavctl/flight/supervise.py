@@ -104,7 +104,7 @@ _FALLBACK_REASONS = {
 
 
 class Supervised(msgspec.Struct, frozen=True, eq=False):
-    """Result of phase 2: what the verdicts make of the tick."""
+    """Result of phase 2: the tick after the verdicts."""
 
     view: FilterView  # the filter without what was dropped
     monitors: MonitorGroup
@@ -185,7 +185,7 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
 
 
 def _drop_after(history: FilterHistory, dropped_after_ns: int) -> FilterHistory:
-    """Drop what was captured after a time and believed."""
+    """Drop the used samples that were captured after a time."""
     return drop_samples(history, lambda sample: read_capture_ns(sample) > dropped_after_ns)
 
 
@@ -244,7 +244,7 @@ def _is_apart(state: ControlState, belief: Belief, view: FilterView, context: Ti
 def observe_velocity(
     monitors: MonitorState, estimate: Estimate | None, context: TickContext
 ) -> VelocityObservation | None:
-    """Put together what the vehicle's own velocity is compared with; None where nothing is."""
+    """Make the data that the vehicle's own velocity is compared with; None without any."""
     bounds = context.controller.envelope
     if bounds is None or estimate is None:
         return None

@@ -69,7 +69,7 @@ def tick(
         is_climbing_or_landing: Whether the vehicle is on its way up or down at our request.
 
     Returns:
-        The state for the next tick, and what to send and record.
+        The state for the next tick, and the output to send and record.
     """
     context = locate_on_grid(state, inputs, controller, is_climbing_or_landing)
     measured = measure(state, context)
@@ -134,7 +134,7 @@ def _make_state(
 def _make_decision(
     context: TickContext, measured: Measured, supervised: Supervised, decided: Decided, acted: Acted
 ) -> Decision:
-    """Make the record of what the tick knew and chose."""
+    """Make the record of the tick's decision."""
     inputs, plan, mission = context.inputs, decided.plan, decided.mission
     monitors, samples, flight = supervised.monitors.engaged, measured.samples, context.controller.mission
     on_waypoints = mission is not None and mission.stay is None and flight.trajectory is None

@@ -105,7 +105,7 @@ def _scale(factor: float, amounts: tuple[float, float, float]) -> tuple[float, f
 
 
 class _TokenBucket:
-    """Token bucket: what a sender may still send now."""
+    """Token bucket of a sender."""
 
     __slots__ = ("_at_ns", "_limit", "bytes", "datagrams", "frames")
 

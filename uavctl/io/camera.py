@@ -45,7 +45,7 @@ class Camera(Protocol):
 
     @property
     def awaits(self) -> str:
-        """Text for people on what it lacks while it is not ready."""
+        """Text for people on the missing data while it is not ready."""
         ...
 
     @property

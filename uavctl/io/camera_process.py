@@ -33,7 +33,7 @@ class CameraProcessConnection(BaseConnection):
 
     Args:
         arguments: of `uavctl.io.camera_host`, without the pipe.
-        advice: what may be amiss where the server does not answer.
+        advice: possible reasons why the server does not answer.
         now: clock for the times of arrival [ns].
         rules: how many messages a second are taken.
     """

@@ -39,7 +39,7 @@ def read_key(path: Path) -> SigningKey:
         mode = stat.S_IMODE(status.st_mode)
         raise KeyFileError(
             f"key file {path}: others than its owner may use it (mode {mode:04o}); run `chmod 600 {path}`, and make a "
-            "new key if somebody may have read it"
+            "new key if others may have read it"
         )
     return _parse_key(path, data)
 

@@ -79,7 +79,7 @@ class SignedConnection:
         return self._inner.count_lost()
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
-        """See `Connection`; what holds no verified frame is dropped."""
+        """See `Connection`; datagrams without a verified frame are dropped."""
         arrived = []
         self._indices.clear()
         for index, (data, at_ns) in enumerate(self._inner.receive(read_all=read_all)):

@@ -32,7 +32,7 @@ def open_source(
     """Open a source of positions.
 
     Args:
-        url: a camera system's, as natnet://SERVER[:PORT]/BODY, or what `uavctl.io.transport.open_connection` takes.
+        url: a camera system's, as natnet://SERVER[:PORT]/BODY, or a URL of `uavctl.io.transport.open_connection`.
         now: clock for the times of arrival [ns].
 
     Raises:

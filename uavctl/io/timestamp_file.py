@@ -64,7 +64,7 @@ def save_timestamp(path: Path, stamp: int) -> None:
 
     Raises:
         OSError: it cannot be written.
-        KeyFileError: what is there is damaged.
+        KeyFileError: the file is damaged.
     """
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with _open_private(path.with_suffix(".lock"), 0) as lock:

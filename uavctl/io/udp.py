@@ -52,7 +52,7 @@ class _UdpConnection(SocketConnection):
         return data or None
 
     def _apply_rate_limits(self, arrived: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
-        """Drop what exceeds the limits, the oldest first, with its entries in `_senders`."""
+        """Drop datagrams beyond the limits, the oldest first, with their entries in `_senders`."""
         admitted = self._rate_limiter.admit(self._senders, [data for data, _ in arrived], self._now())
         if all(admitted):
             return arrived

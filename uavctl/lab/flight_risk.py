@@ -134,7 +134,7 @@ def rehearse_flights(
 
 @dataclass(frozen=True, eq=False)
 class _Draws:
-    """What is random in N flights of T steps."""
+    """Random draws of N flights of T steps."""
 
     disturbances: Array  # w (N, T, n_w)
     known_steps: Counts  # step that knows the position of each step first (N, T)
@@ -200,7 +200,7 @@ class FlightFilter(PositionFilter):
 
 
 class _Pilot:
-    """What flies in one run: mission, and the plan that it is on."""
+    """State of one run: mission and plan."""
 
     def __init__(self, config: Config, design: ConditionedDesign, controller: Controller) -> None:
         self._design, self._mission, self._dt_ns = design, controller.mission, controller.dt_ns

@@ -133,7 +133,7 @@ class ParamValue(Message, frozen=True, kw_only=True):
 
 
 class EstimatorFlags(Message, frozen=True, kw_only=True):
-    """ESTIMATOR_STATUS or EKF_STATUS_REPORT: what the vehicle's own estimator trusts."""
+    """ESTIMATOR_STATUS or EKF_STATUS_REPORT: sources that the vehicle's own estimator trusts."""
 
     flags: int  # ESTIMATOR_STATUS_FLAGS, which are EKF_STATUS_FLAGS
 

@@ -65,7 +65,7 @@ class Relay:
         last_ns: time of the tick that passed the last one on; None before.
         kept: poses that were kept back, by reason.
         silent_for: reason why the vehicle gets no position now, a key of `REASONS`; empty while it gets them.
-        attitude_fault: what is wrong with the attitude of poses now, a key of `REASONS`; empty while it is right.
+        attitude_fault: fault of the attitude of poses now, a key of `REASONS`; empty while it is right.
     """
 
     def __init__(self, config: RelayConfig) -> None:

@@ -48,7 +48,7 @@ class AttitudeCheck:
         self._new: tuple[int, float] | None = None  # capture and reference of a new steady heading
 
     def find_fault(self, captured_ns: int, attitude: Quaternion, turn: VehicleTurn, *, armed: bool) -> str | None:
-        """Return what is wrong with the attitude of the next pose, `TILTED` or `TURNED`; None if nothing."""
+        """Return the fault of the next pose's attitude, `TILTED` or `TURNED`; None without one."""
         roll_rad, pitch_rad, heading_rad = euler_from_quaternion(attitude)
         samples = turn.select(captured_ns)
         if not samples:

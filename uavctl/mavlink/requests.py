@@ -1,4 +1,4 @@
-"""One request to the vehicle: when to repeat it, what the vehicle answered, when to give up.
+"""One request to the vehicle: its repetition, the vehicle's answer, and its end.
 
 Pure: time is an argument.
 

@@ -206,7 +206,7 @@ class FrameAuthenticator:
         stream: the connection carries a stream of bytes, not datagrams.
 
     Attributes:
-        refused: what was dropped, by reason.
+        refused: counts of dropped frames, by reason.
     """
 
     def __init__(self, signer: FrameSigner, *, stream: bool) -> None:

@@ -111,7 +111,7 @@ class Answer(msgspec.Struct, frozen=True, eq=False):
         """Return two lines: how it ended, and where it begins."""
         if not self.inputs.size:
             return f"no plan: {self.status.value}, method {self.method}"
-        relaxed_text = f", {len(self.relaxed)} limits gave way" if self.relaxed else ""
+        relaxed_text = f", {len(self.relaxed)} limits relaxed" if self.relaxed else ""
         begins = ", ".join(f"{value:.4g}" for value in self.inputs[0])
         head = f"plan of {len(self.inputs)} steps: {self.status.value}, cost {self.cost:.6g}, method {self.method}"
         return f"{head}{relaxed_text}\n  first input: {begins}"

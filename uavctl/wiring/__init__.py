@@ -1,1 +1,1 @@
-"""Composition: from a configuration to what flies."""
+"""Composition: from a configuration to the controller."""

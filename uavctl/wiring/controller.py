@@ -143,7 +143,7 @@ def require_value(value: Value | None, key: str) -> Value:
         DesignError: It is missing.
     """
     if value is None:
-        raise DesignError(key, "is missing, and what is asked for needs it", "add it, as the presets have it")
+        raise DesignError(key, "is missing, and this request needs it", "add it, as the presets have it")
     return value
 
 

@@ -111,7 +111,7 @@ class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def hint(self) -> str:
-        """What to do; empty without a problem."""
+        """Remedy; empty without a problem."""
         texts = []
         if self.relaxes:
             texts.append(

@@ -234,7 +234,7 @@ def test_what_is_kept_of_mavlink_is_bounded(tmp_path: Path) -> None:
     (row,) = rows_of(TLOGS[0])[:1]
     kept = hostile.message(1, row[3].ljust(500, b"\0")) * 62_000
     path = put(tmp_path, hostile.MAGIC + hostile.chunk(hostile.channel(1, 0, "/m", "x") + kept))
-    with pytest.raises(RecordingError, match=r"p, offset 8: a record makes what is read into memory more than"):
+    with pytest.raises(RecordingError, match=r"p, offset 8: a record makes the bytes in memory more than"):
         read_mcap(path)
 
 
@@ -281,7 +281,7 @@ def test_schemas_that_change_cost_what_their_bytes_do(tmp_path: Path) -> None:
 def test_definitions_that_pack_well_do_not_fill_the_memory(kind: str, tmp_path: Path) -> None:
     path = put(tmp_path, hostile.make_definitions(1000, kind))
     limit_bytes = 3 * FREE_KEPT_BYTES  # a record is kept as bytes and as text
-    with limit_memory(limit_bytes), pytest.raises(RecordingError, match="a record makes what is read into memory more"):
+    with limit_memory(limit_bytes), pytest.raises(RecordingError, match="a record makes the bytes in memory more"):
         read_mcap(path)
     with limit_memory(limit_bytes):
         assert any(isinstance(item, Damage) and "read into memory" in item.reason for item in scan_file(path))

@@ -131,7 +131,7 @@ def _select_first(*verdicts: Verdict) -> Verdict:
 
 
 def continue_unengaged(state: MonitorState, inertial_mps2: Vec3) -> MonitorState:
-    """Return the state for a vehicle that others fly from now on: it goes on from what inertial data have shown.
+    """Return the state for a vehicle that others fly from now on; the state by inertial data stays.
 
     Args:
         inertial_mps2: Acceleration that they show now, local NED [m/s²].

@@ -60,7 +60,7 @@ LastMotionNs = tuple[int, int, int]  # when the vehicle last moved north, east, 
 
 
 class SourceTrack(msgspec.Struct, frozen=True, eq=False):
-    """What the samples of one source have shown so far."""
+    """Statistics of the samples of one source."""
 
     at_ns: int  # capture time of its newest sample [ns]
     position_m: Vec3  # its value

@@ -40,7 +40,7 @@ FADE_MPS = 0.05  # a fifth of the difference of velocities that ends a flight
 
 
 class Outcome(Enum):
-    """What becomes of a position."""
+    """Outcome for a position."""
 
     COUNTS = "counts"
     REFUSED = "refused"  # it may have jumped
@@ -81,7 +81,7 @@ def suspend(track: JumpTrack, at_ns: int) -> JumpTrack:
 
 
 def update(track: JumpTrack, offset_m: Vec3, std_m: Array, at_ns: int, age_s: float) -> tuple[JumpTrack, Outcome]:
-    """Take a position inside the gate, which was noted; return too what becomes of it.
+    """Take a position inside the gate, which was noted; return its outcome, too.
 
     Args:
         offset_m: Position less the shift and the prediction.

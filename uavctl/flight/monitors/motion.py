@@ -1,4 +1,4 @@
-"""Record that several monitors share: what was sent, the distance by the vehicle's own velocity, and the observer.
+"""Record that several monitors share: sent setpoints, the distance by the vehicle's own velocity, and the observer.
 
 1. `update_motion` takes a tick: the setpoint that acted, the vehicle's own velocity, its inertial data.
 2. `take_position` takes a position that was believed, if it is enough newer than those before to show something: the

@@ -39,7 +39,7 @@ _MEDIAN_3D = 1.538  # median length of a vector of three independent values with
 
 
 class NoiseTrack(msgspec.Struct, frozen=True):
-    """Last positions of all sources, and what they have shown."""
+    """Last positions of all sources, and their statistics."""
 
     last: tuple[_Place, ...] = ()  # up to three
     residuals_m: tuple[float, ...] = ()  # newest last, scaled to the noise of a single position

@@ -1,4 +1,4 @@
-"""Data of a tick that monitors compare, the bounds of what is possible, and what helps to say it in words."""
+"""Data of a tick that monitors compare, physical bounds, and texts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOTION_NS = 300_000_000  # age up to which the vehicle's own velocity and attitu
 
 @dataclass(frozen=True)
 class EnvelopeParameters:
-    """Bounds of what is physically possible in flight; vectors are north, east, down."""
+    """Physical bounds in flight; vectors are north, east, down."""
 
     axes: tuple[bool, ...]  # which axes the plant has; the others are not compared
     lower_m: Vec3  # position limits; minus infinity where there is none

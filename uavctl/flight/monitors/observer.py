@@ -162,7 +162,7 @@ def _split_spans(
 
 
 def correct_observer(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
-    """Correct by a position; return too whether its innovation was beyond the bound, whatever drives the observer."""
+    """Correct by a position; return too whether its innovation was beyond the bound, with any input of the observer."""
     noise = max(std_m, POSITION_STD_M) ** 2
     # S = P_pp + R; K = P H' / S
     variance = float(observer.cov[0, 0]) + noise

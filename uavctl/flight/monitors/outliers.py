@@ -74,7 +74,7 @@ class OutlierTrack:
 def make_reach(
     plant: Plant, limits: LimitsParameters, parameters: GateParameters, tick_ns: int, ticks_per_horizon: int
 ) -> Reach:
-    """Make the reach of a plant whose inputs are what the setpoint limiter lets through."""
+    """Make the reach of a plant whose inputs pass the setpoint limiter."""
     a, b, _ = plant.transition(tick_ns * 1e-9)
     bounds = np.array([limits.accel_mps2[AXES.index(axis)] for axis in plant.axes])
     largest = np.abs(np.linalg.pinv(plant.accel_map)) @ bounds

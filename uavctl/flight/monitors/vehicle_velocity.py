@@ -31,7 +31,7 @@ _DISTRUSTED = Verdict(Action.DISTRUST_VEHICLE_VELOCITY, EventCode.VELOCITY)
 
 
 class VelocityObservation(msgspec.Struct, frozen=True, eq=False):
-    """The vehicle's own velocity, and what it is compared with."""
+    """The vehicle's own velocity, and the data that it is compared with."""
 
     monitors: MonitorState
     at_ns: int  # the tick [ns]

@@ -281,7 +281,7 @@ def _make_scene_section(
 
 
 def _draw_differences(view: CampaignView) -> Iterator[Part]:
-    """Draw what the baselines cost more than each SMPC, for each disturbance and plant."""
+    """Draw the extra cost of the baselines over each SMPC, for each disturbance and plant."""
     for scene_index, scene in enumerate(view.cells_by_scene):
         for number, controller in enumerate(view.styles.controllers):
             scene_verdicts = [v for v in view.verdicts if v.smpc.controller == controller and v.group[1:] == scene]
@@ -390,7 +390,7 @@ def _list_failures(view: CampaignView) -> list[tuple[str, ...]]:
 def _show_failures(view: CampaignView) -> Iterator[Part]:
     rows = _list_failures(view)[:_SHOWN_FAILURES]
     if rows:
-        columns = ("cell", "controller", "where", "run", "what ended it")
+        columns = ("cell", "controller", "where", "run", "reason")
         yield render_table(columns, rows, frozenset({0, 3}), kind="dense")
 
 
@@ -401,18 +401,18 @@ def _explain_failures(view: CampaignView) -> str:
 
 def _list_sections(view: CampaignView) -> Iterator[PageSection[CampaignView]]:
     """Return the page's list; there is a section on costs and limits for each disturbance and plant."""
-    yield PageSection("What happened", lambda view: [render_list(describe_outcome(view))])
-    yield PageSection("What was compared", _show_compared)
+    yield PageSection("Result", lambda view: [render_list(describe_outcome(view))])
+    yield PageSection("Compared cells", _show_compared)
     yield PageSection(
         "Does the SMPC cost less, at equal or lower violation rates?",
         _show_verdicts,
         note="“Yes” where every baseline costs more than the SMPC, or breaks state or input limits more often: none is "
-        "as cheap at equal or lower rates. The columns say what each baseline costs, over the SMPC's cost. Less and "
+        "as cheap at equal or lower rates. The columns have the cost of each baseline over the SMPC's. Less and "
         "more are judged by the intervals of the differences run by run.",
         empty_text="No SMPC was flown.",
     )
     yield PageSection(
-        "What each baseline costs more than the SMPC",
+        "Extra cost of each baseline over the SMPC",
         _draw_differences,
         note="All controllers meet the same disturbances and the same losses, so their costs are subtracted run by "
         "run; the interval is that of the mean difference, over the SMPC's mean cost. Right of zero the SMPC costs "

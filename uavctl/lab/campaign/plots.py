@@ -42,7 +42,7 @@ class MarkerStyle:
     full: bool
 
     def make_mark(self, text: str) -> Mark:
-        """Return the legend's entry of what has this style."""
+        """Return the legend's entry of a style."""
         return Mark("marker", self.role, text, _MARKER_PATHS[self.marker], self.full)
 
 
@@ -270,7 +270,7 @@ def draw_differences(
     heading = fill(title, _TITLE_WIDTH)
     extra_in = _TITLE_LINE_IN * heading.count("\n")
     with open_canvas(name, 0.9 + get_rows_height_in(labels, len(baselines)) + extra_in) as canvas:
-        ax = canvas.axes(heading, "what the baseline costs more [%]", "", get_label_width_in(labels))
+        ax = canvas.axes(heading, "extra cost of the baseline [%]", "", get_label_width_in(labels))
         lower_axes(ax, extra_in)
         ax.set_xscale("symlog", linthresh=LINEAR_PERCENT, linscale=0.8)
         ax.axvline(0.0, color=colour("ink"), lw=0.9)
@@ -282,7 +282,7 @@ def draw_differences(
         ax.xaxis.set_major_formatter(FuncFormatter(format_plain))
         ax.xaxis.set_minor_formatter(NullFormatter())
         draw_rows(ax, labels)
-    yield Drawing(name, canvas.svg, f"{title}: what each baseline costs more, by link, with its interval")
+    yield Drawing(name, canvas.svg, f"{title}: extra cost of each baseline, by link, with its interval")
 
 
 def _draw_difference(ax: Axes, comparison: BaselineComparison, position: float, styles: ControllerStyles) -> None:

@@ -21,7 +21,7 @@ class FilterBelief:
 
 
 class PositionFilter:
-    """Kalman filter of N runs, one position a step, in whatever order they come.
+    """Kalman filter of N runs, one position a step, in any order of arrival.
 
     A position is captured where a step begins. There the flight's filter (`uavctl.flight.kalman`) has drawn its
     new disturbance, so only x of its z = (x, w) is kept, and one step is x := A x + B u with noise E W E'. The first

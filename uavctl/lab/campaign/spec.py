@@ -374,7 +374,7 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     """Read the campaign of a file, with another number of runs if one is given; return it with the file's text.
 
     Raises:
-        ConfigError: With all problems found, one a line: place, key, reason, what to do.
+        ConfigError: With all problems found, one a line: place, key, reason, remedy.
     """
     spec, collector, text = read_spec(path, CampaignSpec)
     spec = spec if runs is None else msgspec.structs.replace(spec, runs=runs)

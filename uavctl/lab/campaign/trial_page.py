@@ -52,7 +52,7 @@ def render_trial_report(
 
 
 class _TrialView(NamedTuple):
-    """What the page shows: the campaign, the figures of its cells, and its file as HTML."""
+    """Content of the page: the campaign, the figures of its cells, and its file as HTML."""
 
     record: TrialCampaignRecord
     cells: Sequence[TrialSummary]
@@ -167,8 +167,8 @@ def _show_failures(view: _TrialView) -> Iterator[Part]:
 
 
 _SECTIONS: tuple[PageSection[_TrialView], ...] = (
-    PageSection("What happened", lambda view: [render_list(_describe_trials(view.cells))]),
-    PageSection("What was compared", _show_compared, note=_OWN_LOOP_NOTE),
+    PageSection("Result", lambda view: [render_list(_describe_trials(view.cells))]),
+    PageSection("Compared cells", _show_compared, note=_OWN_LOOP_NOTE),
     *(
         PageSection(
             _SCENARIO_TITLES[scenario],

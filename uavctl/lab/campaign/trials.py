@@ -153,7 +153,7 @@ class TrialCampaignRecord(CampaignRecord[TrialPlace], frozen=True, kw_only=True)
 
 
 class NumberedTrialCell(NamedTuple):
-    """One cell of a trial campaign: its record, and what is flown."""
+    """One cell of a trial campaign: its record and its flights."""
 
     record: TrialCellRecord
     cell: TrialCell
@@ -286,7 +286,7 @@ def read_trial(path: Path, runs: int | None = None) -> tuple[TrialSpec, str]:
     Its `config` is as `load_config` takes it.
 
     Raises:
-        ConfigError: With all problems found, one a line: place, key, reason, what to do.
+        ConfigError: With all problems found, one a line: place, key, reason, remedy.
     """
     spec, collector, text = read_spec(path, TrialSpec)
     name = resolve_configuration(path, spec.config)

@@ -200,7 +200,7 @@ def _describe_allowance(comparison: BaselineComparison) -> str:
     if sentences:
         return "".join(sentences)
     allowance = f"states {format_percent(allowed_states)}, inputs {format_percent(allowed_inputs)}"
-    return f" That is within what the SMPC's design allows ({allowance}): its caution is what costs."
+    return f" The SMPC's design allows that ({allowance}): its caution costs more."
 
 
 def _describe_limits(comparison: BaselineComparison) -> str:

@@ -266,7 +266,7 @@ class Senders:
     def count_losses(self, sender: Address) -> NDArray[np.int64]:
         """Return the number of lost messages after each one of a sender: by regular stamps, else by sequence numbers.
 
-        A bridge numbers its own messages, so its numbers do not show what was lost before it.
+        A bridge numbers its own messages, so its numbers do not show earlier losses.
         """
         stamps = np.unique([stamp for stamp, _ in self._stamps.get(sender, ())])
         losses_by_stamps = _count_missing_frames(np.diff(stamps))

@@ -33,7 +33,7 @@ def render_identify_page(identification: Identification, positions: PositionHist
 
 
 class _IdentifyView(NamedTuple):
-    """What the page shows: the fit, and the positions that it was made of."""
+    """Content of the page: the fit, and its positions."""
 
     fit: Identification
     positions: PositionHistory
@@ -204,7 +204,7 @@ def _draw_loss_runs(identification: Identification) -> Drawing:
 
 
 _SECTIONS: tuple[PageSection[_IdentifyView], ...] = (
-    PageSection("What happened", lambda view: [render_list(_describe_fit(view))]),
+    PageSection("Result", lambda view: [render_list(_describe_fit(view))]),
     PageSection(
         "Response",
         _show_response,
@@ -232,7 +232,7 @@ _SECTIONS: tuple[PageSection[_IdentifyView], ...] = (
         "and by the one before; both without inertial data.",
     ),
     PageSection(
-        "What is left unexplained",
+        "Unexplained rest",
         _draw_residuals,
         note="Each position minus its prediction from those before: with a right model, 95 % are between the lines, "
         "and one does not tell the next (correlations within the band).",
@@ -243,6 +243,7 @@ _SECTIONS: tuple[PageSection[_IdentifyView], ...] = (
         note="Delays by capture stamps and arrival; runs of losses (bars) beside those of independent losses (dots).",
     ),
     PageSection(
-        "Configuration", lambda view: [render_folded("TOML with what was identified", dump_config(view.fit.config))]
+        "Configuration",
+        lambda view: [render_folded("TOML of the identified configuration", dump_config(view.fit.config))],
     ),
 )

@@ -51,7 +51,7 @@ class BoxMonitor:
 
     Attributes:
         repeated: number of motions that were ended and repeated smaller.
-        reason: why the flight was ended, and what to do; empty while it was not.
+        reason: why the flight was ended, and the remedy; empty while it was not.
 
     Args:
         config: the configuration that is flown, with the excitation as its mission.
@@ -160,7 +160,7 @@ class BoxMonitor:
         self._has_ended = True
         self.reason = (
             f"{reason}. Give a larger box, or lower limits.accel_mps2 and the speeds of [sets], or correct lag, gain "
-            "and drag of [plant] by what the first part of this flight shows (`uavctl identify`)"
+            "and drag of [plant] by the first part of this flight (`uavctl identify`)"
         )
 
     def _describe_distance(self, observation: Observation) -> str:

@@ -1,4 +1,4 @@
-"""Changes of a configuration by an identified flight: what the flight shows well, and nothing else.
+"""Changes of a configuration by an identified flight: only the well-determined values.
 
 1. An axis is adopted as a whole (lag, drag, gain) if the flight determines all of it, else kept as a whole. The dead
    time is common to all axes, so the lag of a kept axis changes by as much the other way: dead time + lag stays.

@@ -24,7 +24,7 @@ _OUTCOMES = {
 
 @dataclass(frozen=True, eq=False)
 class _TuneView(ComparisonView):
-    """What the page shows: the comparison of both flights, and their figures."""
+    """Content of the page: the comparison of both flights, and their figures."""
 
     figures: TuneFigures
 

@@ -240,7 +240,7 @@ def make_comparison_rows(what_if: WhatIf) -> Iterator[tuple[str, ...]]:
 
 
 class _WhatIfView(NamedTuple):
-    """What the page shows: the result, and both flights cut to the compared part."""
+    """Content of the page: the result, and both flights cut to the compared part."""
 
     result: WhatIf
     recorded: FlightData
@@ -261,7 +261,7 @@ def _explain_ages(view: _WhatIfView) -> str:
 
 _BOTH = tuple(Mark("line", role, name) for role, name in zip(overlays.ROLES, ("recorded", "what-if"), strict=False))
 _SECTIONS: tuple[PageSection[_WhatIfView], ...] = (
-    PageSection("What happened", lambda view: [render_list(describe_what_if(view.result))]),
+    PageSection("Result", lambda view: [render_list(describe_what_if(view.result))]),
     PageSection(
         "Path",
         lambda view: overlays.draw_paths(view.flights),

@@ -1,1 +1,1 @@
-"""MPC with risk conditioned on the age of information: what flies by default."""
+"""MPC with risk conditioned on the age of information: the default controller."""

@@ -1,6 +1,6 @@
 """Back-offs: risk of each age and row, standard deviations of the rows, and back-offs of the reference.
 
-The margin of a row is b - c'x: what its limit leaves. The back-off β is the margin that a row must keep.
+The margin of a row is b - c'x. The back-off β is the margin that a row must keep.
 
 1. `allocate_by_age` and `allocate_equally` give each age t a budget ε̄_t of the allowed risk 1 - δ_x, with
    Σ_t π_t ε̄_t = 1 - δ_x - P(a > H).

@@ -1,4 +1,4 @@
-"""Design for flights with risk conditioned on the age: solver, hash of what its answers depend on, and its record."""
+"""Design for flights with risk conditioned on the age: solver, hash of its parameters, and its record."""
 
 from __future__ import annotations
 

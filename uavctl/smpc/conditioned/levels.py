@@ -64,7 +64,7 @@ def compute_stage_weights(link: tuple[float, float], horizon: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """Allocation of the risk to the ages, and what follows from it for each age of a position [steps]."""
+    """Allocation of the risk to the ages, and its back-offs for each age of a position [steps]."""
 
     risk: AgeRisk  # the budgets
     budgets: Array  # ε̄ of the stages (H, H)

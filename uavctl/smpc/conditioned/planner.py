@@ -88,7 +88,7 @@ class _RowBackoffs(msgspec.Struct, frozen=True, eq=False):
 
 
 class _Rest(msgspec.Struct, frozen=True, eq=False):
-    """Where a plan to a target rests, and what follows from it for any state."""
+    """Place where a plan to a target rests, with all terms that do not depend on the state."""
 
     allocation: Allocation  # allocation of the risk
     reference: Array  # equilibrium that the plan ends in (n_x,)
