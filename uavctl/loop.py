@@ -103,6 +103,7 @@ class ControlLoop:
         self._hand_over = HandoverStateMachine(config.hand_over, waits_for_landing=config.relay.enabled)
         self._handover_config = config.hand_over
         self._vehicle_messages: tuple[CommandAck | StatusText, ...] = ()
+        self._statuses: tuple[VehicleStatus, ...] = ()  # that the vehicle has sent for this tick
         self._state = make_initial_state()
         self._inbox = Inbox()
         self._uses_inertial = config.estimator.inertial_std_mps2 > 0.0
@@ -239,8 +240,18 @@ class ControlLoop:
                 decision, so that a solve does not delay a round trip.
             core_error: Recorded error of the core in this tick: it fails with that, and is not run.
         """
-        inputs = self._gather_inputs(tick, at_ns, missed_ticks, stop)
-        if stop:
+        return self.run_inputs(self.gather_inputs(tick, at_ns, missed_ticks, stop), send, core_error)
+
+    def run_inputs(self, inputs: StepInput, send: Send, core_error: str = "") -> Ticked:
+        """Run a tick with its inputs: those that were gathered, or in their place other measurements; see `tick`.
+
+        The inputs are recorded first, so that a replay knows when the tick ran.
+        """
+        at_ns = inputs.at_ns
+        self._put("/uavctl/step_input", at_ns, inputs)
+        for status in self._statuses:
+            self._put("/uavctl/vehicle", status.at_ns, status)
+        if inputs.stop:
             self.account.note_requested_end(Cause.ENDED_BY_OPERATOR)  # unless who asks has said why
         for name, link in self._links.items():
             for data in link.due(at_ns):
@@ -471,10 +482,10 @@ class ControlLoop:
             ),
         )
 
-    def _gather_inputs(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
-        """Gather the inputs of the tick. They are recorded first, so that a replay knows when the tick ran."""
+    def gather_inputs(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
+        """Take what has come for the tick of `at_ns`; return its inputs, for `run_inputs`."""
         arrivals = self._inbox.take(at_ns)
-        self._vehicle_messages = arrivals.messages
+        self._vehicle_messages, self._statuses = arrivals.messages, arrivals.statuses
         self._motion = self._motion if arrivals.motion is None else arrivals.motion
         self._update_vehicle(arrivals.statuses)
         inputs = StepInput(
@@ -490,9 +501,6 @@ class ControlLoop:
             answered_ns=self._external_solve_ns,
         )
         self._external_solve_ns = 0
-        self._put("/uavctl/step_input", at_ns, inputs)
-        for status in arrivals.statuses:
-            self._put("/uavctl/vehicle", status.at_ns, status)
         return inputs
 
     def _update_vehicle(self, statuses: Sequence[VehicleStatus]) -> None:

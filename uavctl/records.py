@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from uavctl.arrays import Array
 
@@ -272,6 +273,10 @@ class StepInput(Record, frozen=True, kw_only=True):
     # measured it; 0 where none was asked for, or time is virtual
     answered_ns: int = 0
 
+    def with_measurements(self, other: StepInput) -> StepInput:
+        """Return these inputs with the positions, the motion and the inertial data of another tick."""
+        return replace(self, samples=other.samples, motion=other.motion, inertial=other.inertial)
+
 
 class Timing(Record, frozen=True, kw_only=True):
     """Times that the shell measured; never an input of the core, never compared in a replay."""
@@ -419,6 +424,8 @@ class Header(Record, frozen=True, kw_only=True):
     # recordings of before: their log times are those of our clock
     zero_utc_ns: int | None = None
     platform: str = ""  # operating system and processor
+    # Positions, motion and inertial data of step inputs are those of a what-if; raw bytes are those of its flight
+    moved_inputs: bool = False
 
 
 class RiskRecord(Record, frozen=True, kw_only=True):

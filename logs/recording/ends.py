@@ -49,6 +49,8 @@ def put_header(
     started_ns: int,
     zero_utc_ns: int | None = VIRTUAL_ZERO_UTC_NS,
     command: str | None = None,
+    *,
+    moved_inputs: bool = False,
 ) -> None:
     """Begin a recording with its header: everything needed to decide alike in a replay.
 
@@ -56,6 +58,7 @@ def put_header(
         started_ns: when it begins, by the flight's clock.
         zero_utc_ns: UTC of time 0 of that clock [ns since 1970]; that of virtual time unless it is given.
         command: command that made it; None: the command line of this process.
+        moved_inputs: whether the recording is of a what-if.
     """
     config, design = prepared.config, prepared.design
     header = Header(
@@ -70,6 +73,7 @@ def put_header(
         cpu=read_cpu_model(),
         zero_utc_ns=zero_utc_ns,
         platform=platform.platform(),
+        moved_inputs=moved_inputs,
     )
     recorder.put(HEADER, started_ns, header)
 

@@ -466,6 +466,7 @@ def replay(
     *,
     finished: bool = True,
     ignored: Labels = frozenset(),
+    moved_inputs: bool = False,
 ) -> ReplayResult:
     """Drive a loop with the recorded inputs, and compare its whole output with the recorded one.
 
@@ -477,6 +478,7 @@ def replay(
         finished: the recording was closed in order; a torn one's last tick may lack records. So may that of a flight
             that a second signal has ended at once.
         ignored: (topic, field) that may differ; of a vector all entries.
+        moved_inputs: the recording is of a what-if: its measurements are not those of its raw bytes.
     """
     produced = _Produced()
     loop = make_loop(produced)
@@ -490,7 +492,8 @@ def replay(
             for command in record.commands:
                 loop.order(command)
             loop.note_solve_time(record.answered_ns)
-            loop.tick(record.tick, record.at_ns, discard, record.missed_ticks, record.stop, core_error)
+            inputs = loop.gather_inputs(record.tick, record.at_ns, record.missed_ticks, record.stop)
+            loop.run_inputs(inputs.with_measurements(record) if moved_inputs else inputs, discard, core_error)
         elif isinstance(record, Datagram) and not record.outgoing:
             loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):

@@ -139,6 +139,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         tolerance,
         finished=not end_problem and not hole_text,
         ignored=ignored,
+        moved_inputs=recorded.moved_inputs,
     )
     return ReplayOutcome(
         result, end_problem, hole_text, changed, find_other_versions(recorded, flown_config.smpc.controller), tolerance

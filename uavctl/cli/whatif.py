@@ -190,8 +190,6 @@ def fly_what_if(request: WhatIfRequest) -> WhatIf:
             compared_s=(course.end_ns - first.origin_ns + first.tick_ns) * 1e-9,
             ended=course.ended,
             largest_departure_m=compute_max_distance_m(first, other),
-            inertial_moved=course.inertial_moved,
-            inertial_left_out=course.inertial_dropped,
             recorded=summarise(first, wall_s=None),
             reproduced=summarise(again, wall_s=None),
             what_if=summarise(other, wall_s=None),
@@ -309,7 +307,7 @@ def _record_changed(
     """Fly the changed configuration and record it; remove an incomplete recording, a seeming shorter flight."""
     recorder = SyncRecorder(path, changed_controller.config.log, derived_topics=DerivedTopics(ViewBuilder()))
     try:
-        put_header(recorder, changed_controller, recorded.started_ns, recorded.zero_utc_ns)
+        put_header(recorder, changed_controller, recorded.started_ns, recorded.zero_utc_ns, moved_inputs=True)
         course = refly(
             history,
             changed_controller.config,

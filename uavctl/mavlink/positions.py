@@ -211,16 +211,12 @@ class PositionDecoder:
         self._new_source_budget -= 1.0
         return True
 
-    def _make_clock(self) -> ClockSync:
-        clock = self._clock
-        return ClockSync(_ns(clock.window_s), _ns(clock.latency_s), _ns(clock.future_tolerance_s))
-
     def _count_eviction(self) -> None:
         self._count_bad(TOO_MANY_SOURCES)
 
     def _estimate_capture_ns(self, message: Position, received_ns: int) -> int | StampRefusal:
         address = (message.system, message.component)
-        clock = self._clocks.record_message(_find_key(message), received_ns, self._make_clock)
+        clock = self._clocks.record_message(_find_key(message), received_ns, lambda: make_clock(self._clock))
         stamp_ns: int | None = None
         if message.boot_ms and message.stamp_us is not None:
             stamp_ns = clock.unwrap_ns(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
@@ -245,6 +241,11 @@ class PositionDecoder:
             if unit is not StampUnit.MICROSECONDS and len(self.units) < MAX_SOURCES:
                 self.units[address] = unit
         return unit is StampUnit.MICROSECONDS
+
+
+def make_clock(config: ClockConfig) -> ClockSync:
+    """Make the clock of a source."""
+    return ClockSync(_ns(config.window_s), _ns(config.latency_s), _ns(config.future_tolerance_s))
 
 
 def _find_key(message: Position) -> tuple[Address, bool]:

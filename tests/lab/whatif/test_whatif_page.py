@@ -54,8 +54,6 @@ def worse_link(summary: FlightSummary) -> WhatIf:
         compared_s=6.0,
         ended="the recording ends",
         largest_departure_m=0.0,
-        inertial_moved=0,
-        inertial_left_out=0,
         recorded=summary,
         reproduced=summary,
         what_if=summary,
@@ -102,14 +100,6 @@ def test_another_link_is_listed_as_a_change(recorded: FlightData) -> None:
     summary = summarise(recorded, wall_s=None)
     (sentence,) = (text for text in describe_what_if(worse_link(summary)) if "link: loss=0.5" in text)
     assert "nothing" not in sentence
-
-
-def test_dropped_inertial_messages_are_reported(recorded: FlightData) -> None:
-    what_if = worse_link(summarise(recorded, wall_s=None))
-    assert not any("inertial" in text for text in describe_what_if(what_if))
-    with_dropped = msgspec.structs.replace(what_if, inertial_moved=30, inertial_left_out=12)
-    (sentence,) = (text for text in describe_what_if(with_dropped) if "inertial" in text)
-    assert sentence.startswith("12 of 42 inertial messages")
 
 
 def test_the_age_is_drawn_against_the_horizon(recorded: FlightData, other: FlightData) -> None:

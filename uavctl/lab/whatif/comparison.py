@@ -62,8 +62,6 @@ class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
     compared_s: float  # both flights are known up to here
     ended: str  # why the comparison ends
     largest_departure_m: float  # largest distance between both positions
-    inertial_moved: int  # inertial messages of the vehicle with the other course's acceleration
-    inertial_left_out: int  # dropped inertial messages: without an attitude of their time, late, or frozen
     recorded: FlightSummary  # all summaries end at compared_s
     reproduced: FlightSummary
     what_if: FlightSummary
@@ -187,7 +185,6 @@ def _compute_max_difference(both: Iterable[dict[int, tuple[float, ...]]]) -> flo
 
 HEADINGS = ("", "recorded", "reproduced", "what-if")
 _COMPUTER_ROWS = ("Decision time", "Clock", "Tick lateness")  # depend on the computer
-_MIN_DROPPED_SHARE = 0.01  # of the inertial messages; a few are always older than the first attitude, or late
 
 
 def render_what_if_page(what_if: WhatIf, recorded: FlightData, other: FlightData) -> str:
@@ -209,13 +206,6 @@ def describe_what_if(what_if: WhatIf) -> list[str]:
     error_text = "" if model.rms_m is None else f", error {model.rms_m:.3g} m (rms)"
     prediction_text = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is explained{error_text}"
     changed = f"Changed: {', '.join(what_if.changed)}" if what_if.changed else "No key of the configuration was changed"
-    inertial = []
-    total = what_if.inertial_moved + what_if.inertial_left_out
-    if what_if.inertial_left_out > _MIN_DROPPED_SHARE * total:
-        inertial.append(
-            f"{what_if.inertial_left_out} of {total} inertial messages of the vehicle are left out of the what-if "
-            "flight: late, frozen, or without an attitude that turns its acceleration."
-        )
     return [
         f"Reproduced with nothing changed, {equality}.",
         f"Model ({model.source}): motion of the next {model.ahead_s:g} s, predicted {model.moves} times"
@@ -223,7 +213,6 @@ def describe_what_if(what_if: WhatIf) -> list[str]:
         f"{changed}; controller {what_if.controller}; link: {what_if.link}.",
         f"Compared over {what_if.compared_s:.1f} s: {what_if.ended}. The flights came "
         f"{what_if.largest_departure_m:.3g} m apart.",
-        *inertial,
     ]
 
 

@@ -3,7 +3,8 @@
 1. Recorded and other flight obey x(k+1) = A x + B u + w with the same w, so their difference obeys
    δ(k+1) = A δ + B (u' − u): the disturbance cancels and need not be known. Between boundaries the same holds in
    continuous time with constant u. Where the vehicle has a dead time, inputs act by that much later.
-2. The recorded inputs pass through the control loop, with positions moved by δ.
+2. The recorded bytes pass through the control loop. The inputs of each tick are moved before it runs: positions and
+   velocities by δ, accelerations by its second derivative.
 3. Another link passes on positions that came, and positions that the recorded link lost.
 """
 
@@ -14,6 +15,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -21,23 +23,32 @@ from msgspec.structs import replace
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from logs.recording.flight import FlightData
-from sim.cameras import COMPONENT_ID, SYSTEM_ID, UPTIME_S
+from sim.cameras import COMPONENT_ID, SYSTEM_ID
 from sim.channel import Channel
 from sim.vehicle.linear import CACHED_TRANSITIONS, LinearModel, make_linear_model
 from uavctl.arrays import Array
 from uavctl.config import Config
-from uavctl.config.connections import DaemonConfig
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
 from uavctl.errors import RecordingError
 from uavctl.flight.controller import Controller
 from uavctl.lab.figure_eight import to_vec3
-from uavctl.lab.whatif.rewrite import InertialFrames, PositionFrame, SourceFrames
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.connection import MOCAP, STREAM_SCHEMES, VEHICLE
-from uavctl.mavlink.framing import RawFrame, scan_frames
-from uavctl.mavlink.messages import Position
-from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, discard
+from uavctl.mavlink.clocksync import ClockSource, ClockSync, StampRefusal
+from uavctl.mavlink.positions import make_clock
+from uavctl.records import (
+    Datagram,
+    PositionSample,
+    Record,
+    Refused,
+    Setpoint,
+    Sink,
+    StepInput,
+    Truth,
+    Vec3,
+    VehicleMotion,
+    discard,
+)
 
 
 @dataclass(frozen=True)
@@ -127,37 +138,27 @@ MIN_POSITIONS = 2
 class RecordedFlight:
     """Recorded flight, prepared for flying it again."""
 
-    # (topic, log time [ns], record), in the order of recording; chunks of byte streams are cut between frames
-    entries: tuple[Entry, ...]
+    entries: tuple[Entry, ...]  # (topic, log time [ns], record), in the order of recording
     flight: FlightData  # the entries by type
     config: Config  # its configuration
     setpoints: dict[int, Vec3]  # acceleration setpoint [m/s²] that was sent in the tick of each time [ns]
     takes_setpoints: dict[int, bool]  # whether the vehicle used setpoints in the tick of each time [ns]
-    samples: dict[int, list[PositionSample]]  # positions of the controller, by time of arrival [ns]
+    samples: tuple[PositionSample, ...]  # positions of the controller
 
-    def get_capture_ns(self, position_frame: PositionFrame, at_ns: int) -> int | None:
-        """Return when a position that arrived at `at_ns` was captured [ns]; None if the controller did not use it.
+    def get_capture_ns(self, sample: PositionSample) -> int:
+        """Return when a position was captured [ns].
 
-        By the simulator's clock in a simulated flight, else by the controller's estimate.
+        In a simulated flight the time of the camera's picture nearest to the controller's estimate, else the estimate.
         """
-        position = position_frame.position
-        source = f"{position.name} {position.system}/{position.component}"
-        for sample in self.samples.get(at_ns, ()):
-            if sample.source == source and sample.position_m == position_frame.position_m:
-                simulated_ns = self.get_simulated_ns(position)
-                return sample.captured_ns if simulated_ns is None else simulated_ns
-        return None
+        truths, camera = self.flight.truths, self.config.sim.camera
+        if not truths or not sample.source.endswith(_SIMULATED_SOURCE):
+            return sample.captured_ns
+        first_ns = truths[0].at_ns + camera.phase_s * 1e9
+        number = round((sample.captured_ns - first_ns) * 1e-9 * camera.rate_hz)
+        return round(first_ns + number * 1e9 / camera.rate_hz)
 
-    def get_simulated_ns(self, position: Position) -> int | None:
-        """Return the capture time by the stamp of the simulated cameras [ns]; None for other positions."""
-        is_simulated = (position.system, position.component) == (SYSTEM_ID, COMPONENT_ID)
-        if not (self.flight.truths and is_simulated and position.stamp_us):
-            return None
-        camera = self.config.sim.camera
-        since_us = (position.stamp_us - round((UPTIME_S + camera.clock_offset_s) * 1e6)) / (
-            1.0 + camera.clock_drift_ppm * 1e-6
-        )
-        return self.flight.truths[0].at_ns + round(since_us * 1e3)
+
+_SIMULATED_SOURCE = f" {SYSTEM_ID}/{COMPONENT_ID}"
 
 
 def make_recorded_flight(entries: Iterable[Entry], config: Config, name: str) -> RecordedFlight:
@@ -169,21 +170,19 @@ def make_recorded_flight(entries: Iterable[Entry], config: Config, name: str) ->
     Raises:
         RecordingError: It has no decision, no flown setpoint, or hardly any position.
     """
-    kept_entries = tuple(_split_at_frames(entries, config.daemon))
+    kept_entries = tuple(entries)
     setpoints: dict[int, Vec3] = {}
     takes_setpoints: dict[int, bool] = {}
-    samples: defaultdict[int, list[PositionSample]] = defaultdict(list)
+    samples: list[PositionSample] = []
     for _, at_ns, record in kept_entries:
         if isinstance(record, Setpoint):
             setpoints[at_ns] = record.accel_mps2
         elif isinstance(record, StepInput):
             takes_setpoints[at_ns] = record.vehicle is not None and record.vehicle.armed and record.vehicle.external
-            for sample in record.samples:
-                samples[sample.received_ns].append(sample)
-    count = sum(map(len, samples.values()))
-    if count < MIN_POSITIONS:
+            samples.extend(record.samples)
+    if len(samples) < MIN_POSITIONS:
         raise RecordingError(
-            f"{name}: holds only {count} positions; a what-if needs at least {MIN_POSITIONS}, of a flight under "
+            f"{name}: holds only {len(samples)} positions; a what-if needs at least {MIN_POSITIONS}, of a flight under "
             "setpoints (`uavctl log info` shows the contents)"
         )
     flight = FlightData.from_records(kept_entries)
@@ -191,7 +190,7 @@ def make_recorded_flight(entries: Iterable[Entry], config: Config, name: str) ->
         raise RecordingError(
             f"{name}: the vehicle never took a setpoint in this recording, so a what-if has nothing to change"
         )
-    return RecordedFlight(kept_entries, flight, config, setpoints, takes_setpoints, dict(samples))
+    return RecordedFlight(kept_entries, flight, config, setpoints, takes_setpoints, tuple(samples))
 
 
 def make_response(history: RecordedFlight, plant: PlantConfig) -> VehicleResponse:
@@ -202,32 +201,6 @@ def make_response(history: RecordedFlight, plant: PlantConfig) -> VehicleRespons
     """
     has_no_dead_time = bool(history.flight.truths) and history.config.sim.plant == "linear"
     return VehicleResponse(make_linear_model(plant), 0 if has_no_dead_time else round(plant.dead_time_s * 1e9))
-
-
-def _split_at_frames(entries: Iterable[Entry], daemon: DaemonConfig) -> Iterator[Entry]:
-    """Return the entries with byte streams cut between frames instead of anywhere."""
-    urls = {VEHICLE: daemon.vehicle, MOCAP: daemon.mocap}
-    streams = {name: _FrameStream() for name, url in urls.items() if url.startswith(STREAM_SCHEMES)}
-    for topic, at_ns, record in entries:
-        if isinstance(record, Datagram) and not record.outgoing and record.link in streams:
-            yield topic, at_ns, replace(record, data=streams[record.link].take_whole_frames(record.data))
-        else:
-            yield topic, at_ns, record
-
-
-class _FrameStream:
-    """Byte stream in chunks, cut between frames."""
-
-    def __init__(self) -> None:
-        self._rest = b""
-        self._in_step = True
-
-    def take_whole_frames(self, chunk: bytes) -> bytes:
-        """Return the complete frames so far; keep an incomplete one for the next chunk."""
-        data = self._rest + chunk
-        result = scan_frames(data, final=False, is_aligned=self._in_step)
-        self._rest, self._in_step = data[result.consumed :], result.is_aligned
-        return data[: result.consumed]
 
 
 TRUTH = "/sim/truth"
@@ -245,8 +218,6 @@ class ReflownFlight:
     deviation: Deviation  # difference from the recorded flight
     end_ns: int = 0  # last tick in which both flew setpoints [ns]
     ended: str = _END_OF_RECORDING  # why it ended there
-    inertial_moved: int = 0  # inertial frames with the new acceleration
-    inertial_dropped: int = 0  # dropped inertial frames
 
 
 def refly(
@@ -276,7 +247,7 @@ def refly(
         if isinstance(record, StepInput):
             flight.run_tick(record)
         elif isinstance(record, Datagram) and not record.outgoing:
-            flight.handle_datagram(record)
+            loop.receive(record.link, record.data, record.at_ns)
         elif isinstance(record, Refused):
             loop.add_refusals(record.link, record.counts, record.at_ns)
         elif isinstance(record, Truth):
@@ -316,31 +287,21 @@ class _ReflownLoop:
         self.course = course
         self.truths: deque[Truth] = deque()  # of boundaries before the next tick
         self.is_over = False
-        daemon = history.config.daemon
-        self._positions_link = VEHICLE if daemon.vehicle == daemon.mocap else MOCAP
-        self._source_frames = SourceFrames(history.config.frame)
-        self._inertial = InertialFrames(daemon)
         self._has_flown_setpoints = False
         self._ended_ns: int | None = None  # since when one of the two flights has no setpoint
-
-    def handle_datagram(self, record: Datagram) -> None:
-        """Pass on a recorded datagram with moved positions, or without positions where another link carries them."""
-        data = self._rewrite_datagram(record.data, record.at_ns, of_vehicle=record.link == VEHICLE)
-        if data or not record.data:
-            self._loop.receive(record.link, data, record.at_ns)
 
     def run_tick(self, record: StepInput) -> None:
         """Run a tick, and let the vehicle respond to the difference in its setpoint."""
         at_ns = record.at_ns
-        if self._other is not None:
-            for arrival_ns, data in self._other.pop_due(at_ns, self.course.deviation):
-                self._loop.receive(self._positions_link, data, arrival_ns)
         for command in record.commands:
             self._loop.order(command)
         if self._loop.outside == self._history.config.smpc.controller:
             self._loop.note_solve_time(record.answered_ns)
         self._tap.setpoint = None
-        ticked = self._loop.tick(record.tick, at_ns, discard, record.missed_ticks, record.stop)
+        inputs = self._loop.gather_inputs(record.tick, at_ns, record.missed_ticks, record.stop)
+        if self._history.flight.header.moved_inputs:
+            inputs = inputs.with_measurements(record)
+        ticked = self._loop.run_inputs(self._move_inputs(inputs), discard)
         self._loop.record_timing(ticked, lateness_ns=0, send_ns=0)
         self._steer_deviation(at_ns, ticked.decision.reason)
         self.record_truth(at_ns)
@@ -383,48 +344,37 @@ class _ReflownLoop:
         else:
             self.is_over = at_ns - self._ended_ns > MAX_PAUSE_NS
 
-    def _rewrite_datagram(self, data: bytes, at_ns: int, *, of_vehicle: bool) -> bytes:
-        """Return the bytes of the other course, with its positions, vehicle velocity and inertial data."""
+    def _move_inputs(self, inputs: StepInput) -> StepInput:
+        """Return the inputs of the other course: positions by its link, and all measurements moved by δ."""
         deviation = self.course.deviation
-        has_deviation = deviation.first_acting_ns is not None
-        if not (has_deviation or of_vehicle or self._other is not None):
-            return data
-        chunks: list[bytes] = []
-        consumed = 0
-        for frame in scan_frames(data, final=True).frames:
-            rewritten = self._rewrite_frame(frame, at_ns, has_deviation=has_deviation)
-            if of_vehicle:  # the monitor of inertial frames also needs other messages
-                inertial = self._inertial.rewrite(
-                    frame, at_ns, deviation.get_acceleration_mps2(at_ns) if has_deviation else None
-                )
-                rewritten = inertial if rewritten is frame.data else rewritten
-            if rewritten is not frame.data:
-                begin = data.index(frame.data, consumed)
-                chunks += (data[consumed:begin], rewritten)
-                consumed = begin + len(frame.data)
-        self.course.inertial_moved = self._inertial.moved
-        self.course.inertial_dropped = self._inertial.dropped
-        return b"".join((*chunks, data[consumed:]))
+        if self._other is not None:
+            inputs = replace(inputs, samples=tuple(self._other.pop_due(inputs.at_ns, self._move_sample)))
+        elif deviation.first_acting_ns is not None:
+            inputs = replace(inputs, samples=tuple(map(self._move_sample, inputs.samples)))
+        if deviation.first_acting_ns is None:
+            return inputs
+        inertial = [
+            replace(sample, accel_mps2=_add(sample.accel_mps2, deviation.get_acceleration_mps2(sample.at_ns)))
+            for sample in inputs.inertial
+        ]
+        motion = None if inputs.motion is None else self._move_motion(inputs.motion)
+        return replace(inputs, motion=motion, inertial=tuple(inertial))
 
-    def _rewrite_frame(self, frame: RawFrame, at_ns: int, *, has_deviation: bool) -> bytes:
-        """Return a frame with its position moved; empty where another link carries it."""
-        position_frame = self._source_frames.find_position(frame) if has_deviation or self._other is not None else None
-        if position_frame is None:
-            return frame.data
-        captured_ns = self._history.get_capture_ns(position_frame, at_ns)
-        # A local NED position that the controller did not use is the vehicle's own estimate.
-        is_own_estimate = captured_ns is None and position_frame.position.local_ned
-        if captured_ns is None and not is_own_estimate:
-            return frame.data
-        if self._other is not None and not is_own_estimate:
-            return b""
-        if not has_deviation:
-            return frame.data
-        deviation = self.course.deviation
-        when_ns = at_ns if captured_ns is None else captured_ns
-        return self._source_frames.move(
-            position_frame, deviation.get_position_m(when_ns), deviation.get_velocity_mps(when_ns)
+    def _move_sample(self, sample: PositionSample) -> PositionSample:
+        deviation, at_ns = self.course.deviation, self._history.get_capture_ns(sample)
+        velocity_mps = sample.velocity_mps
+        return replace(
+            sample,
+            position_m=_add(sample.position_m, deviation.get_position_m(at_ns)),
+            velocity_mps=velocity_mps and _add(velocity_mps, deviation.get_velocity_mps(at_ns)),
         )
+
+    def _move_motion(self, motion: VehicleMotion) -> VehicleMotion:
+        """Return the vehicle's own velocity in the other course; its attitude stays."""
+        if motion.velocity_mps is None or motion.velocity_ns is None:
+            return motion
+        offset_mps = self.course.deviation.get_velocity_mps(motion.velocity_ns)
+        return replace(motion, velocity_mps=_add(motion.velocity_mps, offset_mps))
 
 
 def _add(a: Vec3, b: Vec3) -> Vec3:
@@ -434,126 +384,106 @@ def _add(a: Vec3, b: Vec3) -> Vec3:
 _LOSSLESS_SHARE = 0.2  # least share of spacings without a loss
 
 
-@dataclass(frozen=True)
-class Capture:
-    """Position at its capture, as sent by its source, or restored if it was lost."""
-
-    at_ns: int  # time of capture, which counts as that of sending [ns]
-    position_frame: PositionFrame  # its frame; for a lost one that of the last one before it
-    offset_m: Vec3 = (0.0, 0.0, 0.0)  # its offset from the position in the frame [m]
-    offset_mps: Vec3 = (0.0, 0.0, 0.0)  # the same of the velocity [m/s]
-    stamp_us: int | None = None  # its stamp; None: that of the frame
-
-
 class SimulatedLink:
     """Link that carries the positions of a recording in place of the recorded one.
 
     Args:
         seed: Seed of the losses, and of the noise of positions that the recording lacks.
         noise_m: Standard deviation of that noise, each axis [m].
-
-    Raises:
-        RecordingError: Too few positions carry a stamp.
     """
 
     def __init__(self, history: RecordedFlight, link: LinkConfig, seed: int, noise_m: float) -> None:
         # The simulator spawns its seeds in the same order, so a simulated flight gets the same losses.
         _, camera_seed, channel_seed = np.random.SeedSequence(seed).spawn(3)
-        self._source_frames = SourceFrames(history.config.frame)
+        self._history = history
         noise = np.random.default_rng(camera_seed)
         self._captures = deque(find_captures(history, lambda: noise_m * noise.standard_normal(3)))
+        self._sent: list[PositionSample] = []
         origin_ns = history.flight.truths[0].at_ns if history.flight.truths else history.flight.origin_ns
         self._channel = Channel(link, channel_seed, origin_ns, round(history.config.plant.dt_s * 1e9))
+        self._has_timesync = any(stats.clock_source == ClockSource.TIMESYNC for stats in history.flight.links)
+        self._clocks = defaultdict[str, ClockSync](lambda: make_clock(history.config.clock))
 
     @property
     def counts(self) -> tuple[int, int]:
         """Positions sent so far, and how many of them were lost."""
         return self._channel.counters.sent, self._channel.counters.lost
 
-    def pop_due(self, to_ns: int, deviation: Deviation) -> list[tuple[int, bytes]]:
-        """Return the datagrams that arrive up to and including `to_ns`, as (arrival [ns], bytes)."""
-        while self._captures and self._captures[0].at_ns <= to_ns:
-            capture = self._captures.popleft()
-            offset_m = _add(capture.offset_m, deviation.get_position_m(capture.at_ns))
-            offset_mps = _add(capture.offset_mps, deviation.get_velocity_mps(capture.at_ns))
-            data = self._source_frames.move(capture.position_frame, offset_m, offset_mps, stamp_us=capture.stamp_us)
+    def pop_due(self, to_ns: int, move: Callable[[PositionSample], PositionSample]) -> Iterator[PositionSample]:
+        """Yield the positions that arrive up to and including `to_ns`, in order of arrival.
+
+        Args:
+            move: Moves a position of the recorded course to the other course.
+        """
+        while self._captures and (at_ns := self._history.get_capture_ns(self._captures[0])) <= to_ns:
             # A recorded flight begins with a known position.
-            self._channel.push(capture.at_ns, data, is_certain=not self._channel.counters.sent)
-        return self._channel.pop_due(to_ns)
+            self._channel.push(at_ns, _encode_number(len(self._sent)), is_certain=not self._sent)
+            self._sent.append(move(self._captures.popleft()))
+        for received_ns, data in self._channel.pop_due(to_ns):
+            number = int.from_bytes(data[:_NUMBER_BYTES], "little")
+            if data.startswith(_encode_number(number)):  # a damaged datagram is not read
+                sample = self._sent[number]
+                captured_ns = self._estimate_capture_ns(sample, received_ns)
+                if not isinstance(captured_ns, StampRefusal):
+                    yield replace(sample, captured_ns=captured_ns, received_ns=received_ns)
+
+    def _estimate_capture_ns(self, sample: PositionSample, received_ns: int) -> int | StampRefusal:
+        """Return the capture time as the controller estimates it: without TIMESYNC by the quickest arrivals."""
+        clock, stamp_ns = self._clocks[sample.source], self._history.get_capture_ns(sample)
+        return sample.captured_ns if self._has_timesync else clock.estimate_capture_ns(stamp_ns, received_ns)
 
 
-def find_captures(history: RecordedFlight, noise: Callable[[], Array]) -> list[Capture]:
-    """Return all positions of a recording in order of capture, including restored lost ones.
-
-    Raises:
-        RecordingError: Too few of them carry a stamp.
-    """
-    received = _collect_received(history)
-    if len(received) < MIN_POSITIONS:
-        raise RecordingError(
-            f"only {len(received)} positions of the recording carry a stamp, so the lost ones are unknown; "
-            "fly them over the recorded link"
-        )
-    path = _VehiclePath(history, received)
-    spacing_us = _compute_spacing_us(history, received)
-    captures = [received[0]]
-    for capture in received[1:]:
-        captures.extend(_restore_lost(captures[-1], capture, spacing_us, path, noise))
-        captures.append(capture)
-    return captures
+_NUMBER_BYTES = 8
 
 
-def _collect_received(history: RecordedFlight) -> list[Capture]:
-    """Return the received positions, each capture once."""
-    source_frames = SourceFrames(history.config.frame)
-    captures_by_stamp: dict[int, Capture] = {}
-    for _, at_ns, record in history.entries:
-        if isinstance(record, Datagram) and not record.outgoing:
-            for position_frame in source_frames.find_positions(record.data):
-                captured_ns = history.get_capture_ns(position_frame, at_ns)
-                if captured_ns is not None and position_frame.position.stamp_us:
-                    captures_by_stamp.setdefault(position_frame.position.stamp_us, Capture(captured_ns, position_frame))
-    return [captures_by_stamp[stamp_us] for stamp_us in sorted(captures_by_stamp)]
+def _encode_number(number: int) -> bytes:
+    """Encode a number twice, so that a damaged datagram shows."""
+    return number.to_bytes(_NUMBER_BYTES, "little") * 2
 
 
-def _compute_spacing_us(history: RecordedFlight, received: list[Capture]) -> float:
-    """Return the time between two positions without a loss between them [µs]."""
-    if history.flight.truths:
-        return 1e6 / history.config.sim.camera.rate_hz
-    spacings = np.diff([_get_stamp_us(capture) for capture in received])
-    return float(np.median(spacings[spacings <= 1.5 * np.quantile(spacings, _LOSSLESS_SHARE)]))
+def find_captures(history: RecordedFlight, noise: Callable[[], Array]) -> list[PositionSample]:
+    """Return all positions of a recording in order of capture, including restored lost ones."""
+    captures = sorted(history.samples, key=lambda sample: sample.captured_ns)
+    for source in dict.fromkeys(sample.source for sample in history.samples):
+        received = [sample for sample in captures if sample.source == source]
+        captures += _restore_lost(history, received, noise)
+    return sorted(captures, key=lambda sample: sample.captured_ns)
 
 
 def _restore_lost(
-    before: Capture, after: Capture, spacing_us: float, path: _VehiclePath, noise: Callable[[], Array]
-) -> list[Capture]:
-    """Return the positions lost between two received ones, evenly spread."""
-    missing = round((_get_stamp_us(after) - _get_stamp_us(before)) / spacing_us) - 1
-    sequence_gap = (
-        after.position_frame.frame.data[_get_number_offset(after)]
-        - before.position_frame.frame.data[_get_number_offset(before)]
-        - 1
-    ) % 256
-    if missing < 1 or not sequence_gap:  # the source sent nothing between these
-        return []
-    captures = []
-    for i in range(1, missing + 1):
-        share = i / (missing + 1)
-        at_ns = before.at_ns + round(share * (after.at_ns - before.at_ns))
-        stamp_us = _get_stamp_us(before) + round(share * (_get_stamp_us(after) - _get_stamp_us(before)))
-        position_m, velocity_mps = path.get_motion(at_ns)
-        offset_m = position_m + noise() - before.position_frame.position_m
-        offset_mps = velocity_mps - path.get_motion(before.at_ns)[1]
-        captures.append(Capture(at_ns, before.position_frame, to_vec3(offset_m), to_vec3(offset_mps), stamp_us))
-    return captures
+    history: RecordedFlight, received: list[PositionSample], noise: Callable[[], Array]
+) -> Iterator[PositionSample]:
+    """Yield the positions that were lost between those received of a source, evenly spread."""
+    if len(received) < MIN_POSITIONS:
+        return
+    path, spacing_ns = _VehiclePath(history, received), _compute_spacing_ns(history, received)
+    for before, after in pairwise(received):
+        gap_ns = after.captured_ns - before.captured_ns
+        count = max(1, round(gap_ns / spacing_ns))
+        for i in range(1, count):
+            sample = replace(before, captured_ns=before.captured_ns + round(i * gap_ns / count))
+            position_m, velocity_mps = path.get_motion(history.get_capture_ns(sample))
+            yield replace(
+                sample,
+                position_m=to_vec3(position_m + noise()),
+                velocity_mps=sample.velocity_mps and to_vec3(velocity_mps),
+            )
+
+
+def _compute_spacing_ns(history: RecordedFlight, received: list[PositionSample]) -> float:
+    """Return the time between two positions without a loss between them [ns]."""
+    if history.flight.truths:
+        return 1e9 / history.config.sim.camera.rate_hz
+    spacings = np.diff([sample.captured_ns for sample in received])
+    return float(np.median(spacings[spacings <= 1.5 * np.quantile(spacings, _LOSSLESS_SHARE)]))
 
 
 class _VehiclePath:
     """Path of the vehicle: through the true states if known, else through the received positions."""
 
-    def __init__(self, history: RecordedFlight, received: list[Capture]) -> None:
+    def __init__(self, history: RecordedFlight, received: list[PositionSample]) -> None:
         truths = history.flight.truths
-        self._origin_ns = received[0].at_ns
+        self._origin_ns = received[0].captured_ns
         if len(truths) >= MIN_POSITIONS:
             times, positions_m = (
                 self._to_seconds([sample.at_ns for sample in truths]),
@@ -561,10 +491,9 @@ class _VehiclePath:
             )
             self._spline = CubicHermiteSpline(times, positions_m, np.array([sample.velocity_mps for sample in truths]))
         else:
-            positions_by_time = {sample.at_ns: sample.position_frame.position_m for sample in received}
-            at_ns = sorted(positions_by_time)
+            positions_by_time = {sample.captured_ns: sample.position_m for sample in received}
             self._spline = CubicSpline(
-                self._to_seconds(at_ns), np.array([positions_by_time[time_ns] for time_ns in at_ns])
+                self._to_seconds(list(positions_by_time)), np.array(list(positions_by_time.values()))
             )
         self._velocity_spline = self._spline.derivative()
 
@@ -575,14 +504,3 @@ class _VehiclePath:
 
     def _to_seconds(self, at_ns: list[int]) -> Array:
         return np.array([(time_ns - self._origin_ns) * 1e-9 for time_ns in at_ns])
-
-
-def _get_stamp_us(capture: Capture) -> int:
-    stamp_us = capture.position_frame.position.stamp_us
-    assert stamp_us is not None  # captures without a stamp were dropped
-    return stamp_us
-
-
-def _get_number_offset(capture: Capture) -> int:
-    """Return the offset of the sequence number in the header of a frame."""
-    return 4 if capture.position_frame.frame.data[0] == 0xFD else 2
