@@ -343,9 +343,9 @@ def draw_flight(seed: int, plant: str = "quadrotor") -> tuple[Config, Config, Co
 
 
 def draw_hover(
-    seed: int, kind: str, plant: str = "quadrotor"
+    seed: int, kind: str, plant: str = "quadrotor", source: str = "velocity", after_s: float = AFTER_S
 ) -> tuple[Config, Config, Controller, list[Deception], float]:
-    """Draw a hover 0.25 to 0.6 m before a wall, with an own velocity that deceives from just before a blackout on."""
+    """Draw a hover 0.25 to 0.6 m before a wall, with a source that deceives from just before a blackout on."""
     rng = np.random.default_rng([seed, 41])
     autopilot, preset = _choose_autopilot(seed)
     believed, _ = prepare_believed(preset, autopilot)
@@ -353,13 +353,13 @@ def draw_hover(
     place = [*rng.uniform(-1.5, 1.5, 2), -float(rng.uniform(0.8, 1.6))]
     place[axis] = float(rng.choice([-1.0, 1.0])) * (upper[axis * (len(upper) // 3)] - float(rng.uniform(0.25, 0.6)))
     waypoint = "[" + ", ".join(f"{x:.2f}" for x in place) + "]"
-    deceptions = [Deception("velocity", kind, blackout_s + float(rng.uniform(-1.0, 0.0)))]
+    deceptions = [Deception(source, kind, blackout_s + float(rng.uniform(-1.0, 0.0)))]
     overrides = (
         f"link.blackout=[[{blackout_s}, {blackout_s + BLACKOUT_S}]]",
         f"sim.start_position_m={waypoint}",
         "mission.hold_s=60.0",
     )
-    config = _load_world(seed, rng, waypoint, blackout_s + BLACKOUT_S + AFTER_S, overrides, plant=plant)
+    config = _load_world(seed, rng, waypoint, blackout_s + BLACKOUT_S + after_s, overrides, plant=plant)
     believed, controller = prepare_believed(
         preset, autopilot, (f"mission.waypoints=[{waypoint}]", "mission.hold_s=60.0")
     )
