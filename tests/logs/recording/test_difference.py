@@ -230,7 +230,6 @@ def test_a_hole_in_a_recovered_recording_is_told(
     assert run(["log", "replay", str(whole)]) == 1
     told = capsys.readouterr()
     assert "recovered from flight.mcap: " in told.err
-    assert "cannot be compared" in told.err
     for heading in ("from [s]", "at [s]"):
         assert heading in told.out
 
@@ -254,12 +253,8 @@ def test_a_changed_configuration_is_shown_with_what_it_changes(
         f"{first.flight_s:.3f} s into the flight, tick {first.tick}",
         f"/uavctl/decision {first.field} ({first.meaning})",
         f"recorded {first.recorded}, replayed {first.replayed}",
-        "a rule of the decision",
-        f"{context.decisions_before} decisions, {context.records_before} records: all identical",
-        "track (",
-        "vehicle OFFBOARD, armed",
-        f"{result.decisions_differing} of {result.decisions - context.decisions_before} from then on",
-        "What becomes of it",
+        f"{context.decisions_before} decisions, {context.records_before} records",
+        f"{result.decisions_differing} of {result.decisions - context.decisions_before}",
         "/uavctl/estimate mean",
     ):
         assert text in told, text
