@@ -179,7 +179,7 @@ def _describe_loss(loss: PositionLoss) -> Iterator[str]:
         bursts = ", lost in bursts" if loss.bursts else ""
         promise_text = ", fewer than promised" if loss.below_promise else ""
         share = f"{100 * (1.0 - loss.believed):.0f} % of the steps"
-        yield f"positions: captured and received within {share}, by the last estimate{promise_text}{bursts}"
+        yield f"positions: received in the step of their capture in {share}, by the last estimate{promise_text}{bursts}"
     if loss.simulated_sent:
         yield f"simulated channel: {loss.simulated_lost} of {loss.simulated_sent} positions lost"
 
