@@ -206,7 +206,8 @@ class Peers:
             if self.cameras.next_ns <= stop_ns:
                 self._capture_position(stop_ns)
                 has_acted = True
-            autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
+            if has_acted:
+                autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
         return stop_ns
 
     def _capture_position(self, at_ns: int) -> None:
