@@ -22,13 +22,16 @@ SIM = load_config("room").sim
 def share_designs(patch: pytest.MonkeyPatch) -> None:
     """Build each design, and its solver, once: no answer of a solver depends on earlier questions.
 
-    test_shortcut.py and test_conditioned.py show that. A design does not depend on the simulated vehicle.
+    test_shortcut.py and test_conditioned.py show that. A design does not depend on the simulated vehicle. Tests of the
+    builders themselves import these by name, and build anew.
     """
     build_solver = controller.build_solver
     share_solver = lru_cache(KEPT)(build_solver)
 
     def find_solver(design: AnyDesign, config: Config) -> Solver:
-        return (build_solver if config.smpc.controller else share_solver)(design, replace(config, sim=SIM))
+        if config.smpc.controller:
+            return build_solver(design, config)
+        return share_solver(design, replace(config, sim=SIM))
 
     patch.setattr(controller, "build_design", _share(controller.build_design))
     patch.setattr(controller, "build_conditioned", _share(controller.build_conditioned))

@@ -14,7 +14,7 @@ from uavctl.wiring.controller import build_conditioned
 
 def requested(name: str) -> list[Answer]:
     """Answers to states from anywhere, of which most are on their way out faster than inputs can brake."""
-    solver = build_conditioned(load_config(name)).solver
+    solver = build_conditioned(load_config(name)).solver  # a new one: what flights share has its guess already
     return [solver.solve(seq, *question) for seq, question in enumerate(draw_questions(solver, 60, 4))]
 
 
