@@ -203,7 +203,10 @@ def believed(place_m: Vec3, parameters: EnvelopeParameters = PARAMETERS) -> Posi
         ((0.0, -1.4, -2.0), (0.0, 0.41, 0.0), True),
         ((0.0, 0.0, -3.4), (0.0, 0.0, 0.41), True),  # the ceiling
         ((0.0, 0.0, -1.4), (0.0, 0.0, -0.41), False),  # the floor stops a vehicle
-        ((2.2, 0.0, -2.0), (0.0, -0.41, 0.0), False),  # along the wall
+        ((2.7, 0.0, -2.0), (0.0, -0.41, 0.0), False),  # along the wall
+        ((-2.7, 0.0, -2.0), (0.0, 0.41, 0.0), False),
+        ((2.25, 0.0, -2.0), (-0.25, 0.0, 0.0), False),  # just 0.5 m before it
+        ((-2.25, 0.0, -2.0), (0.25, 0.0, 0.0), False),
     ],
 )
 def test_the_own_way_leads_to_a_wall_or_the_ceiling(place_m: Vec3, off_m: Vec3, near: bool) -> None:

@@ -196,11 +196,9 @@ def _find_drift(
     for (since_ns, _, velocity_before), then in zip(places if is_any_far else (), thens, strict=False):
         s = (at_ns - since_ns) * 1e-9
         off = _subtract(now, then)
-        if math.hypot(*off) <= (NEAR_DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps:
-            continue
         if aligned is None:
             off = _remove_smoothing(off, _subtract(velocity, velocity_before))
-        # |ō - ō_0| > (2 s + 0.16 s) v_max
+        # |ō - ō_0| > (2 s + 0.16 s) v_max, or (1 s + 0.16 s) v_max
         begin_s = NEAR_DRIFT_S if _leads_out(observation, off) else DRIFT_S
         if math.hypot(*off) > (begin_s + DRIFT_PART * s) * parameters.disagreement_mps:
             return (s, off), places, aligned
