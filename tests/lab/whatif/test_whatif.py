@@ -124,6 +124,20 @@ def test_lost_positions_are_restored_in_order() -> None:
     assert len(result) - len(recorded.samples) > 5
 
 
+@pytest.mark.parametrize(
+    ("effect", "share"),
+    [({"corrupt": 1.0}, 0), ({"truncate": 1.0}, 0), ({"duplicate": 1.0}, 1), ({"oversize": 1.0}, 1)],
+)
+def test_a_damaged_position_is_lost_and_a_doubled_one_counts_once(effect: dict[str, float], share: int) -> None:
+    link = msgspec.structs.replace(load_case_config(ROOM).link, loss=0.0, **effect)
+    other = SimulatedLink(history(ROOM), link, 1, 0.0)
+    arrived = list(other.pop_due(100_000_000_000, lambda sample: sample))
+    captures = find_captures(history(ROOM), lambda: np.zeros(3))
+    assert other.counts == (len(captures), 0)
+    places = sorted(sample.position_m for sample in arrived)
+    assert places == sorted(sample.position_m for sample in captures) * share
+
+
 def test_a_link_that_loses_all_ends_in_the_fallback() -> None:
     link = msgspec.structs.replace(load_case_config(ROOM).link, blackout=((1.0, 100.0),))
     memory, course = fly_again(ROOM, other_link=SimulatedLink(history(ROOM), link, 1, 0.0))

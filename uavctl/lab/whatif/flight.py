@@ -148,7 +148,7 @@ class RecordedFlight:
     def get_capture_ns(self, sample: PositionSample) -> int:
         """Return when a position was captured [ns].
 
-        In a simulated flight the time of the camera's picture nearest to the controller's estimate, else the estimate.
+        In a simulated flight the camera's capture nearest to the controller's estimate, else that estimate.
         """
         truths, camera = self.flight.truths, self.config.sim.camera
         if not truths or not sample.source.endswith(_SIMULATED_SOURCE):
@@ -401,7 +401,9 @@ class SimulatedLink:
         self._sent: list[PositionSample] = []
         origin_ns = history.flight.truths[0].at_ns if history.flight.truths else history.flight.origin_ns
         self._channel = Channel(link, channel_seed, origin_ns, round(history.config.plant.dt_s * 1e9))
-        self._has_timesync = any(stats.clock_source == ClockSource.TIMESYNC for stats in history.flight.links)
+        # Without TIMESYNC the quickest arrivals show the clock of a source, as in a flight.
+        has_timesync = any(stats.clock_source == ClockSource.TIMESYNC for stats in history.flight.links)
+        self._clock_offset_ns = 0 if has_timesync else None
         self._clocks = defaultdict[str, ClockSync](lambda: make_clock(history.config.clock))
 
     @property
@@ -423,14 +425,11 @@ class SimulatedLink:
             number = int.from_bytes(data[:_NUMBER_BYTES], "little")
             if data.startswith(_encode_number(number)):  # a damaged datagram is not read
                 sample = self._sent[number]
-                captured_ns = self._estimate_capture_ns(sample, received_ns)
+                captured_ns = self._clocks[sample.source].estimate_capture_ns(
+                    self._history.get_capture_ns(sample), received_ns, self._clock_offset_ns
+                )
                 if not isinstance(captured_ns, StampRefusal):
                     yield replace(sample, captured_ns=captured_ns, received_ns=received_ns)
-
-    def _estimate_capture_ns(self, sample: PositionSample, received_ns: int) -> int | StampRefusal:
-        """Return the capture time as the controller estimates it: without TIMESYNC by the quickest arrivals."""
-        clock, stamp_ns = self._clocks[sample.source], self._history.get_capture_ns(sample)
-        return sample.captured_ns if self._has_timesync else clock.estimate_capture_ns(stamp_ns, received_ns)
 
 
 _NUMBER_BYTES = 8
