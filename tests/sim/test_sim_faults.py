@@ -152,7 +152,7 @@ def test_a_file_of_faults_comes_after_those_of_the_configuration(tmp_path: Path)
         ("[[fualt]]\n", 'fualt: unknown key (nearest valid name "fault")'),
         ("fault = 3\n", "faults.toml:1: fault: "),
         ("[[fault]\n", "TOML syntax"),
-        ("", "faults.toml:1: fault: missing key; add it: list of tables (entries: at most 1000), what happens"),
+        ("", "faults.toml:1: fault: missing key; add it: list of tables (entries: at most 1000)"),
         (
             '[[fault]]\nat_s = 1\nkind = "parameter"\nname = "COM_OF_LOS_T"\n',
             'faults.toml:4: fault[0].name: px4 has no parameter "COM_OF_LOS_T" (nearest valid name "COM_OF_LOSS_T")',
