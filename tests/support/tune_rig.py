@@ -6,17 +6,19 @@ import io
 import json
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 from endings_rig import ON_THE_FLOOR, TAKE_OFF, EndingRig, use_virtual_time
+from report_rig import omit_figures
 from sim_rig import decode
 
 from uavctl.cli.app import run
 from uavctl.daemon.lock import find_lock_paths
+from uavctl.lab.identify import fit
 from uavctl.lab.tune import excitation
 
 BOX = "--box=-1.2,-1.1,-2,1.2,1.1,-0.4"
@@ -39,9 +41,13 @@ def make_arguments(folder: Path, *more: str) -> list[str]:
 
 
 @contextmanager
-def short_flights() -> Iterator[None]:
-    """One large step of each axis and a third of the hold: enough to identify, in a quarter of the time."""
-    with pytest.MonkeyPatch.context() as patch:
+def short_flights(*, has_figures: bool = False) -> Iterator[None]:
+    """One large step of each axis and a third of the hold: enough to identify, in a quarter of the time.
+
+    Every second dead time is tried; test_identify.py tries them all. Pages leave their figures out unless asked for.
+    """
+    with pytest.MonkeyPatch.context() as patch, nullcontext() if has_figures else omit_figures():
+        patch.setattr(fit, "COARSE_S", fit.COARSE_S[::2])
         patch.setattr(excitation, "STEP_SIZES", excitation.STEP_SIZES[-1:])
         patch.setattr(excitation, "HOLD_S", 7.5)
         yield

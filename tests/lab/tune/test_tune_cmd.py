@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tune_rig import BOX, START, make_arguments, run_command, short_flights
@@ -29,6 +30,7 @@ from uavctl.cli.tune_run import (
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import UsageError
+from uavctl.lab.identify.result import Identification, identify
 from uavctl.lab.tune.excitation import parse_box
 
 # An ArduPilot here, a PX4 in test_tune_real.py.
@@ -37,10 +39,22 @@ PILOT = 'sim.fault=[{at_s=6.0,kind="mode",name="POSCTL"}]'
 
 
 @pytest.fixture(scope="module")
-def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def identified() -> list[Identification]:
+    """What the whole run identified."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory: pytest.TempPathFactory, identified: list[Identification]) -> Path:
     """A whole run, its recordings in several files."""
     folder = tmp_path_factory.mktemp("tune") / "run"
-    with short_flights():
+
+    def keep(*given: Any) -> Identification:
+        identified.append(identify(*given))
+        return identified[-1]
+
+    with short_flights(has_figures=True), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tune_run, "identify", keep)
         assert run(make_arguments(folder, *OURS)) == 0
     return folder
 
@@ -115,8 +129,13 @@ def test_a_run_that_is_done_flies_no_more(finished_run: Path, capsys: pytest.Cap
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
 def test_complete_flights_count_without_the_rest(
-    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished_run: Path,
+    identified: list[Identification],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(tune_run, "identify", lambda *_: identified[0])
     folder = tmp_path / "copy"
     shutil.copytree(finished_run, folder)
     for name in (TUNED_FILE, PAGE_FILE):
@@ -194,10 +213,12 @@ def test_a_recording_takes_the_place_of_the_first_flight(
 
     monkeypatch.setattr(tune_run, "fly_once", pressed)
     arguments = ["tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback", "--set", START]
-    code, out, _ = run_command(capsys, *arguments, *OURS, "--json")
+    with short_flights():
+        code, out, _ = run_command(capsys, *arguments, *OURS, "--json")
     assert code == TuneExit.INTERRUPTED
     document = json.loads(out)
     assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED_FILE)
+    assert tune_run.read_tuned(folder / TUNED_FILE).plant == tune_run.read_tuned(finished_run / TUNED_FILE).plant
     assert not (folder / BEFORE_FOLDER).exists()
     (second,) = requests
     assert second.mission.waypoints == parse(read_header(flight).config_toml, "flight").config.mission.waypoints
