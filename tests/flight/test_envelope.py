@@ -14,16 +14,17 @@ from msgspec import structs
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from uavctl.arrays import Array
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import acceleration
 from uavctl.flight.monitors.acceleration import AccelerationState, compute_lean_mps2
-from uavctl.flight.monitors.engaged import INITIAL
+from uavctl.flight.monitors.engaged import INITIAL, shift_positions
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation, select_axes
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.outside import describe_beyond, describe_sideways, is_outside
+from uavctl.flight.monitors.smoothing import DelayChange
 from uavctl.flight.monitors.verdict import Verdict
 from uavctl.records import Vec3, VehicleMotion
 
@@ -136,6 +137,21 @@ def test_a_climb_that_is_not_upright_is_found_by_either_velocity(by_itself: bool
         known = structs.replace(ours, position_m=ZERO, velocity_mps=other if by_itself else moved)
         assert bool(describe_sideways(known)) == is_found
         assert bool(describe_sideways(ours)) == (is_found and by_itself)
+
+
+@pytest.mark.fault(100)
+def test_right_after_a_change_of_the_delay_only_a_place_beyond_the_margin_is_outside() -> None:
+    """The plan has just learned how near the limit is: let go, a vehicle flies on further than with its brake."""
+    for ago_ns, position, outside in (
+        (SECOND_NS, (2.9, 0.0, -2.0), False),
+        (SECOND_NS + 1, (2.9, 0.0, -2.0), True),
+        (SECOND_NS, (4.0, 0.0, -2.0), True),
+    ):
+        ours = structs.replace(seen(AT_NS), position_m=position, velocity_mps=(2.0, 0.0, 0.0))
+        watching = monitors(outside_ns=AT_NS - 100 * MS)
+        shifted = shift_positions(watching, DelayChange(0.1, ()), AT_NS - ago_ns)
+        assert (update(shifted, ours, PARAMETERS)[1] is not None) == outside
+        assert update(watching, ours, PARAMETERS)[1] is not None
 
 
 def test_being_outside_has_to_persist() -> None:

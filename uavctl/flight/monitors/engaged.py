@@ -92,12 +92,13 @@ def update(
     return state, _select_first(first, wrong_response, unresolved, is_out, no_effect, no_answer)
 
 
-def shift_positions(state: MonitorState, change: DelayChange) -> MonitorState:
-    """Move what was estimated of positions, as if they had come so; velocities are compared anew."""
+def shift_positions(state: MonitorState, change: DelayChange, at_ns: int) -> MonitorState:
+    """Move what was estimated of positions in a tick, as if they had come so; velocities are compared anew."""
     motion = state.motion
     if motion.observer is not None:
         motion = replace(motion, observer=shift_observer(motion.observer, *change.shift(motion.observer.at_ns)))
-    return replace(state, motion=motion, velocity=VelocityState())
+    outside_state = replace(state.outside, shifted_ns=at_ns)
+    return replace(state, motion=motion, velocity=VelocityState(), outside=outside_state)
 
 
 def _update_with_position(

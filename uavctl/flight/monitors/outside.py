@@ -3,7 +3,9 @@
 1. Each side of each axis: is the estimate beyond the limit by more than the margin, and not on its way back?
 2. Would the distance to stop end beyond the margin?
 3. One of both holds for 0.1 s. Then: end the plans.
-4. A vehicle that climbs by itself flies sideways. Then: break the climb off.
+4. Right after the delay of positions has changed, the second question is not asked: the estimate has moved to a limit,
+   and the plan brakes there already.
+5. A vehicle that climbs by itself flies sideways. Then: break the climb off.
 
 False alarms (docs/soak.md): 1 of 600 missions, where a burst of losses followed the take-off.
 """
@@ -22,6 +24,7 @@ from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 from uavctl.records import Vec3
 
 LASTS_NS = 100_000_000  # one estimate alone may be a late sample's fault
+SHIFTED_NS = 1_000_000_000  # time in which a plan stops a vehicle at 1.5 m/s before a limit that it has just learned of
 RETURNS_MPS = 0.3  # a vehicle outside that moves so fast towards the limit is on its way back
 STANDS_MPS = 0.05  # an outward speed that is shown as 0.0 m/s
 SIDEWAYS_MPS = 0.6  # upright climbs in gusts of 5 m/s came to 0.25 m/s
@@ -37,21 +40,23 @@ class OutsideState(msgspec.Struct, frozen=True):
     """State of the monitor."""
 
     since_ns: int | None = None  # since when the estimate has been outside [ns]; None while it is not
+    shifted_ns: int | None = None  # when the delay of positions last changed [ns]; None before
 
 
 def update(state: OutsideState, observation: TickObservation) -> tuple[OutsideState, Verdict]:
     """Take a tick."""
     tick, parameters = observation.tick, observation.parameters
-    text = _describe_outside(tick, parameters)
+    brakes = state.shifted_ns is None or tick.at_ns - state.shifted_ns > SHIFTED_NS
+    text = _describe_outside(tick, parameters, brakes=brakes)
     vehicle_mps = read_vehicle_velocity(tick.motion, tick.at_ns)
     if text is not None and vehicle_mps is not None and _is_velocity_uncertain(observation.motion):
         # One position does not tell an early gust from a late one: the estimated velocity may be twice the true one.
-        text = _describe_outside(replace(tick, velocity_mps=vehicle_mps), parameters)
+        text = _describe_outside(replace(tick, velocity_mps=vehicle_mps), parameters, brakes=brakes)
     if text is None:
-        return OutsideState(), NO_VERDICT
+        return OutsideState(shifted_ns=state.shifted_ns), NO_VERDICT
     since_ns = state.since_ns or tick.at_ns
     lasts = tick.at_ns - since_ns >= LASTS_NS
-    return OutsideState(since_ns), end_plans(EventCode.OUTSIDE, text) if lasts else NO_VERDICT
+    return replace(state, since_ns=since_ns), end_plans(EventCode.OUTSIDE, text) if lasts else NO_VERDICT
 
 
 def _is_velocity_uncertain(motion: Motion) -> bool:
