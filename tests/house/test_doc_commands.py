@@ -59,7 +59,7 @@ def find_expected_commands() -> list[str]:
 
 
 def test_what_people_expect_has_a_command_in_each_of_its_rows() -> None:
-    assert len(find_expected_commands()) == 28
+    assert len(find_expected_commands()) == 18
     assert {shlex.split(command)[0] for command in find_expected_commands()} <= {"uavctl", "pytest", "make"}
 
 

@@ -311,7 +311,7 @@ class LimitsConfig(Section, frozen=True, kw_only=True):
     slew_mps3: Annotated[float, declare("largest change of a setpoint in a second, each axis", "m/s³", 1e-6, 1e6)]
     tilt_deg: Annotated[
         Annotated[float, Meta(ge=1, le=80)] | None,
-        declare("largest tilt that setpoints ask for, of both horizontal axes together; default: no limit", "deg"),
+        declare("largest tilt of setpoints, both horizontal axes together; default: none", "deg"),
     ] = None
 
 
