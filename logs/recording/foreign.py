@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+import msgspec
 from mcap.records import Channel, Schema
 
 from logs.recording.budget import ExcessError, ReadBudget
@@ -96,57 +97,60 @@ class ForeignMcap:
     notes: tuple[str, ...] = ()  # what was left out, and what was odd about the times, in sentences
 
 
-class _ChannelStream:
+class _ChannelStream(msgspec.Struct, gc=False):
     """One channel as a stream of bytes.
 
-    Args:
-        schema: Schema of the channel's messages, if they have one.
+    A file may have a channel for every 60 bytes: it holds no dictionary, nothing that leads back to it, and no list
+    before its first message, so the garbage collector is spared.
+
+    Attributes:
+        topic: Topic of the channel.
+        encoding: Encoding of its messages.
+        kind: Name of their schema; empty if they have none.
         unwrap: Makes a frame of each message, if they are MAVLink wrapped by ROS.
         is_requested: It was asked for, so it is read however little MAVLink is in it.
         budget: Bounds the kept bytes.
+        messages: Number of messages so far.
+        pieces: Log times [ns] and bytes of messages; None before any.
+        probe: First bytes of a channel in which no frame was found yet; None where none is looked for.
+        is_unreadable: Nothing in it is MAVLink.
+        unreadable: Number of messages that cannot be unwrapped, and
+        reason: why the last one cannot.
     """
 
-    __slots__ = (
-        *("_budget", "_is_requested", "_is_unreadable", "_pieces", "_probe", "_reason", "_unreadable", "_unwrap"),
-        *("encoding", "kind", "messages", "topic"),
-    )  # no dictionary each: a file may have a channel for every 60 bytes
-
-    def __init__(
-        self,
-        channel: Channel,
-        schema: Schema | None,
-        unwrap: Unwrapper | None,
-        *,
-        is_requested: bool,
-        budget: ReadBudget,
-    ) -> None:
-        self.topic, self.encoding = channel.topic, channel.message_encoding
-        self.kind = "" if schema is None else schema.name
-        self.messages = 0
-        self._unwrap, self._budget = unwrap, budget
-        self._is_requested = is_requested
-        self._pieces: list[tuple[int, bytes]] = []
-        self._probe: bytearray | None = None if is_requested or self._unwrap else bytearray()
-        self._is_unreadable = False
-        self._unreadable, self._reason = 0, ""
+    topic: str
+    encoding: str
+    kind: str
+    unwrap: Unwrapper | None
+    is_requested: bool
+    budget: ReadBudget
+    messages: int = 0
+    pieces: list[tuple[int, bytes]] | None = None
+    probe: bytearray | None = None
+    is_unreadable: bool = False
+    unreadable: int = 0
+    reason: str = ""
 
     def add_message(self, at_ns: int, data: bytes) -> None:
         """Add a message of log time `at_ns`."""
         self.messages += 1
-        if self._is_unreadable:
+        if self.is_unreadable:
             return
-        if self._unwrap is not None:
+        if self.unwrap is not None:
             try:
-                data = self._unwrap(data)
+                data = self.unwrap(data)
             except UnreadableError as error:
-                self._unreadable, self._reason = self._unreadable + 1, str(error)
+                self.unreadable, self.reason = self.unreadable + 1, str(error)
                 return
         if not data:
             return
-        self._budget.keep(_PIECE_BYTES + len(data))
-        self._pieces.append((at_ns, data))
-        if self._probe is not None:
-            self._probe_frames(data)
+        self.budget.keep(_PIECE_BYTES + len(data))
+        if self.pieces is None:
+            self.pieces = []
+            self.probe = None if self.is_requested or self.unwrap else bytearray()
+        self.pieces.append((at_ns, data))
+        if self.probe is not None:
+            self._probe_frames(self.probe, data)
 
     def make_packets(self) -> tuple[tuple[TlogPacket, ...], tuple[str, ...]]:
         """Return the channel's packets, none if it holds no MAVLink, and remarks on it.
@@ -155,16 +159,16 @@ class _ChannelStream:
             RecordingError: Its log times are all zero.
         """
         clock = MonotonicClock()
-        pieces = [(clock.convert(at_ns), data) for at_ns, data in self._pieces]
+        pieces = [(clock.convert(at_ns), data) for at_ns, data in self.pieces or ()]
         # A recorder of several threads writes not in order; a clock that was set back has been put right.
         stream = cut_stream(sorted(pieces, key=lambda piece: piece[0]))
         notes = []
-        if self._unreadable:
-            notes.append(f"{self.topic}: {count(self._unreadable, 'message')} left out: {self._reason}")
+        if self.unreadable:
+            notes.append(f"{self.topic}: {count(self.unreadable, 'message')} left out: {self.reason}")
         is_mostly_mavlink = 2 * stream.left_out_bytes < sum(len(data) for _, data in pieces)
-        if stream.valid_count and not (is_mostly_mavlink or self._is_requested):
+        if stream.valid_count and not (is_mostly_mavlink or self.is_requested):
             notes.append(f"{self.topic}: not taken, most of it is no MAVLink; `--topic {self.topic}` takes it")
-        if not stream.valid_count or not (is_mostly_mavlink or self._is_requested):
+        if not stream.valid_count or not (is_mostly_mavlink or self.is_requested):
             return (), tuple(notes)
         clock.check(self.topic)
         if stream.left_out_bytes:
@@ -176,16 +180,15 @@ class _ChannelStream:
         kind = f", {self.kind}" if self.kind else ""
         return f"{self.topic} ({self.encoding or 'no encoding'}{kind}, {self.messages})"
 
-    def _probe_frames(self, data: bytes) -> None:
+    def _probe_frames(self, probe: bytearray, data: bytes) -> None:
         """Look for a first frame; drop the messages of a channel without one in `_PROBED_BYTES`."""
-        assert self._probe is not None
-        self._probe += data[: _PROBED_BYTES - len(self._probe)]
-        if len(self._probe) < _PROBED_BYTES:
+        probe += data[: _PROBED_BYTES - len(probe)]
+        if len(probe) < _PROBED_BYTES:
             return
-        self._is_unreadable = not cut_stream([(0, bytes(self._probe))]).valid_count
-        self._probe = None
-        if self._is_unreadable:
-            self._pieces.clear()
+        self.is_unreadable = not cut_stream([(0, bytes(probe))]).valid_count
+        self.probe = None
+        if self.is_unreadable:
+            self.pieces = []
 
 
 def is_foreign(path: Path) -> bool:
@@ -263,7 +266,8 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
     Raises:
         ExcessError: A record asks for more than the budget has; names its offset.
     """
-    schemas: dict[int, Schema] = {}
+    # Contents by id: encoding, name, definition
+    schemas: dict[int, tuple[str, str, bytes]] = {}
     # By the content of a schema, and the encoding of messages: a recorder may repeat a schema for each topic.
     unwrappers: dict[tuple[str, str, bytes, str], Unwrapper | None] = {}
     budget = ReadBudget(size)
@@ -274,22 +278,25 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
                 if stream is not None and (not topics or stream.topic in topics):
                     stream.add_message(record.at_ns, record.data)
             elif isinstance(record, Schema):
-                if schemas.get(record.id) != record:
+                content = record.encoding, record.name, record.data
+                if schemas.get(record.id) != content:
                     budget.keep(len(record.name) + len(record.data))
-                    schemas[record.id] = record
+                    schemas[record.id] = content
             elif record.id not in streams:
                 budget.keep(_PIECE_BYTES + len(record.topic) + len(record.message_encoding))
-                schema, encoding = schemas.get(record.schema_id), record.message_encoding
-                unwrap: Unwrapper | None = None
-                if schema is not None:
-                    content = schema.encoding, schema.name, schema.data, encoding
-                    if content not in unwrappers:
-                        unwrappers[content] = make_unwrapper(encoding, schema.encoding, schema.name, schema.data)
-                        if unwrappers[content] is not None:
-                            budget.keep(DEFINITION_RATIO * len(schema.data))
-                    unwrap = unwrappers[content]
+                schema_encoding, name, definition = schemas.get(record.schema_id, ("", "", b""))
+                key = schema_encoding, name, definition, record.message_encoding
+                if key not in unwrappers:
+                    unwrappers[key] = make_unwrapper(record.message_encoding, schema_encoding, name, definition)
+                    if unwrappers[key] is not None:
+                        budget.keep(DEFINITION_RATIO * len(definition))
                 streams[record.id] = _ChannelStream(
-                    record, schema, unwrap, is_requested=record.topic in topics, budget=budget
+                    topic=record.topic,
+                    encoding=record.message_encoding,
+                    kind=name,
+                    unwrap=unwrappers[key],
+                    is_requested=record.topic in topics,
+                    budget=budget,
                 )
     except TornError:
         return True
