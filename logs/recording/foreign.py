@@ -284,9 +284,12 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
                     schemas[record.id] = content
             elif record.id not in streams:
                 budget.keep(_PIECE_BYTES + len(record.topic) + len(record.message_encoding))
-                schema_encoding, name, definition = schemas.get(record.schema_id, ("", "", b""))
+                schema = schemas.get(record.schema_id)
+                schema_encoding, name, definition = schema or ("", "", b"")
                 key = schema_encoding, name, definition, record.message_encoding
-                if key not in unwrappers:
+                if schema is None:
+                    unwrappers[key] = None
+                elif key not in unwrappers:
                     unwrappers[key] = make_unwrapper(record.message_encoding, schema_encoding, name, definition)
                     if unwrappers[key] is not None:
                         budget.keep(DEFINITION_RATIO * len(definition))
