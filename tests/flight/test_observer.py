@@ -14,9 +14,10 @@ from msgspec import structs
 
 from uavctl.arrays import SECOND_NS, Array
 from uavctl.event_codes import EventCode
+from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import acceleration
 from uavctl.flight.monitors.acceleration import AccelerationState, describe_acceleration, describe_push
-from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged, shift_positions
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import (
@@ -27,6 +28,7 @@ from uavctl.flight.monitors.observer import (
     move_along,
     predict_observer,
 )
+from uavctl.flight.monitors.smoothing import DelayChange
 from uavctl.records import Vec3, VehicleMotion
 
 BOUND_MPS2 = PARAMETERS.unexplained_mps2
@@ -348,3 +350,30 @@ def test_a_push_is_described_with_and_without_an_attitude() -> None:
     assert describe_push(INITIAL.motion, None, START_NS) == describe_acceleration(INITIAL.motion.push_mps2, None)
     leaning = VehicleMotion(attitude_rad=(0.0, 1.0, 0.0), attitude_ns=START_NS)
     assert describe_push(flown.motion, leaning, START_NS) != describe_push(flown.motion, None, START_NS)
+
+
+@pytest.mark.parametrize("has_inertial", [False, True])
+def test_positions_that_move_leave_the_observer_as_if_they_had_come_so(has_inertial: bool) -> None:
+    """A constant own velocity v and a delay of τ move all positions by τ v."""
+    v: Vec3 = (0.5, -0.4, 0.2)
+    change = DelayChange(0.2, ((START_NS - SECOND_NS, v, v, ZERO), (START_NS + 9 * SECOND_NS, v, v, ZERO)))
+    moved = [0.2 * one for one in v]
+
+    def fly(from_tick: int) -> MonitorState:
+        """Positions that come moved from a tick on; those before are moved then."""
+        watching = INITIAL
+        for tick in range(40):
+            at_ns = START_NS + tick * TICK_NS
+            if tick == from_tick:
+                watching = shift_positions(watching, change, at_ns)
+            place = 0.3 * np.sin(0.1 * tick + np.arange(3)) + (tick >= from_tick) * np.array(moved)
+            tick_seen = seen(at_ns, sample(at_ns, position_m=vec3(place)))
+            if has_inertial:
+                tick_seen = structs.replace(tick_seen, inertial_mps2=(0.3, 0.1, 0.0))
+            watching, _ = update(watching, tick_seen, PARAMETERS)
+        return watching
+
+    late, at_once = fly(20).motion.observer, fly(0).motion.observer
+    assert late is not None and at_once is not None
+    assert late.mean == pytest.approx(at_once.mean, abs=1e-12)
+    assert shift_positions(INITIAL, change, START_NS).motion.observer is None

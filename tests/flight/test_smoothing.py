@@ -164,3 +164,17 @@ def test_what_was_known_before_the_window_moves_with_its_positions() -> None:
     # Between two own velocities v_f is interpolated: its slope is right to a fraction of the change of v_f'.
     assert there.shift(at_ns)[1] == pytest.approx((after - before) / 2e-3, abs=0.02)
     assert math.hypot(*there.shift(at_ns)[0]) > 0.05
+
+
+def test_a_velocity_that_is_none_is_not_noted() -> None:
+    track, _ = fly(follow, 0.5)
+    at_ns = track.flown[-1][0]
+    nothing = VehicleMotion(velocity_mps=None, velocity_ns=None, attitude_rad=None, attitude_ns=None)
+    bad = replace(nothing, velocity_mps=(0.0, math.nan, 0.0), velocity_ns=at_ns + 50 * MS)
+    again = replace(nothing, velocity_mps=(0.1, 0.1, 0.1), velocity_ns=at_ns)
+    assert all(smoothing.note_velocity(track, motion) is track for motion in (None, nothing, bad, again))
+
+
+def test_a_position_that_is_no_newer_shows_nothing() -> None:
+    track, _ = fly(follow, 0.5)
+    assert smoothing.update(track, track.seen_ns, (9.0, 9.0, 9.0)) is track
