@@ -68,7 +68,7 @@ def fly(
         at_ns = START_NS + round(at_s * 1e9)
         vx, vy, vz = velocity(at_s).tolist()
         motion = VehicleMotion(velocity_mps=(vx, vy, vz), velocity_ns=at_ns, attitude_rad=None, attitude_ns=None)
-        track, _ = smoothing.adopt(smoothing.note_velocity(track, motion))
+        track, _ = smoothing.advance(track, motion, at_ns)
         if rng.random() >= lost:
             north, east, down = (places(at_s) + noise_m * rng.standard_normal(3)).tolist()
             track = smoothing.update(track, at_ns, (north, east, down))
@@ -178,3 +178,16 @@ def test_a_velocity_that_is_none_is_not_noted() -> None:
 def test_a_position_that_is_no_newer_shows_nothing() -> None:
     track, _ = fly(follow, 0.5)
     assert smoothing.update(track, track.seen_ns, (9.0, 9.0, 9.0)) is track
+
+
+@pytest.mark.parametrize("has_motion", [False, True])
+def test_without_a_recent_velocity_nothing_is_added(has_motion: bool) -> None:
+    """Else the last one would move all later positions: a hold beside a wall was 0.7 m outside."""
+    track, _ = fly(lambda at_s: follow(at_s, LAGS["0.2 s late"]), 6.0)
+    last_ns = track.flown[-1][0]
+    old = VehicleMotion(velocity_mps=(1.0, 0.0, 0.0), velocity_ns=last_ns, attitude_rad=None, attitude_ns=None)
+    motion = old if has_motion else None
+    after, change = smoothing.advance(track, motion, last_ns + 301 * MS)
+    assert track.late_s > 0.1 and change is not None and change.change_s == -track.late_s
+    assert after.compute_lag_m(last_ns + 301 * MS) == (0.0, 0.0, 0.0)
+    assert smoothing.advance(track, old, last_ns + 300 * MS)[0].late_s == track.late_s

@@ -164,7 +164,7 @@ def _update_delay(
     """Update the delay of positions; none counts while others fly, or while the vehicle's own velocity is wrong."""
     if not context.was_in_control or state.monitors.engaged.velocity_change.velocity_wrong_ns is not None:
         return smoothing.forget(track)
-    return smoothing.adopt(smoothing.note_velocity(track, context.inputs.motion))
+    return smoothing.advance(track, context.inputs.motion, context.at_ns)
 
 
 def _restart(kalman: Kalman, samples: GatedSamples, at_ns: int) -> GatedSamples:

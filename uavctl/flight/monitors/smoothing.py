@@ -9,8 +9,8 @@
 4. τ v_f is added to each position. Where the delay that counts changes, all that was estimated with the one before
    moves along: no estimate takes the change for motion.
 
-A longer delay than `LARGEST_S` is no smoothing. Nothing counts while the own velocity is wrong, while others fly, or
-within a second after a silence: then positions correct the own velocity.
+A longer delay than `LARGEST_S` is no smoothing. Nothing counts while the own velocity is wrong or missing, while others
+fly, or within a second after a silence: then positions correct the own velocity.
 
 False alarms: in 15 flights of both autopilots and plants without smoothing, τ was 0.01 s at most.
 """
@@ -26,7 +26,7 @@ import msgspec
 from msgspec.structs import replace
 
 from uavctl.flight.limits import ZERO
-from uavctl.flight.monitors.observation import MOTION_NS
+from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
 from uavctl.records import Vec3, VehicleMotion
 
 # Delays that count: clocks are known to hundredths, and a constant delay of 0.3 s looks like one of 0.32 s.
@@ -82,6 +82,18 @@ class DelayChange(msgspec.Struct, frozen=True):
         # δ v_f; δ v_f' = δ (v - v_f) / τ_f
         slope = _combine(velocity, 1.0 / FILTER_S, filtered, -1.0 / FILTER_S)
         return _scale(self.change_s, filtered), _scale(self.change_s, slope)
+
+
+def advance(
+    track: SmoothingTrack, motion: VehicleMotion | None, at_ns: int
+) -> tuple[SmoothingTrack, DelayChange | None]:
+    """Note the own velocity and let the estimated delay count; without a recent velocity forget all.
+
+    Without it v_f would stay at its last value, and move all later positions.
+    """
+    if read_vehicle_velocity(motion, at_ns) is None:
+        return forget(track)
+    return adopt(note_velocity(track, motion))
 
 
 def adopt(track: SmoothingTrack) -> tuple[SmoothingTrack, DelayChange | None]:
