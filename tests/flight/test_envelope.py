@@ -19,7 +19,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import acceleration
 from uavctl.flight.monitors.acceleration import AccelerationState, compute_lean_mps2
-from uavctl.flight.monitors.engaged import INITIAL, shift_positions
+from uavctl.flight.monitors.engaged import INITIAL, shift_monitors
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation, select_axes
 from uavctl.flight.monitors.observer import Observer
@@ -149,7 +149,7 @@ def test_right_after_a_change_of_the_delay_only_a_place_beyond_the_margin_is_out
     ):
         ours = structs.replace(seen(AT_NS), position_m=position, velocity_mps=(2.0, 0.0, 0.0))
         watching = monitors(outside_ns=AT_NS - 100 * MS)
-        shifted = shift_positions(watching, DelayChange(0.1, ()), AT_NS - ago_ns)
+        shifted = shift_monitors(watching, DelayChange(0.1, ()), AT_NS - ago_ns)
         assert (update(shifted, ours, PARAMETERS)[1] is not None) == outside
         assert update(watching, ours, PARAMETERS)[1] is not None
 

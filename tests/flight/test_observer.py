@@ -17,7 +17,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import acceleration
 from uavctl.flight.monitors.acceleration import AccelerationState, describe_acceleration, describe_push
-from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged, shift_positions
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged, shift_monitors
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import (
@@ -365,7 +365,7 @@ def test_positions_that_move_leave_the_observer_as_if_they_had_come_so(has_inert
         for tick in range(40):
             at_ns = START_NS + tick * TICK_NS
             if tick == from_tick:
-                watching = shift_positions(watching, change, at_ns)
+                watching = shift_monitors(watching, change, at_ns)
             place = 0.3 * np.sin(0.1 * tick + np.arange(3)) + (tick >= from_tick) * np.array(moved)
             tick_seen = seen(at_ns, sample(at_ns, position_m=vec3(place)))
             if has_inertial:
@@ -376,4 +376,4 @@ def test_positions_that_move_leave_the_observer_as_if_they_had_come_so(has_inert
     late, at_once = fly(20).motion.observer, fly(0).motion.observer
     assert late is not None and at_once is not None
     assert late.mean == pytest.approx(at_once.mean, abs=1e-12)
-    assert shift_positions(INITIAL, change, START_NS).motion.observer is None
+    assert shift_monitors(INITIAL, change, START_NS).motion.observer is None

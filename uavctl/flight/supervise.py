@@ -308,7 +308,7 @@ def _update_engaged(
         observation = replace(observation, position_m=None)
     monitors = before.engaged
     if measured.delay_change is not None:
-        monitors = engaged.shift_positions(monitors, measured.delay_change, context.at_ns)
+        monitors = engaged.shift_monitors(monitors, measured.delay_change, context.at_ns)
     starts = monitors.motion.began_ns is None
     if starts and before.unengaged.confirms_positions and reading is not None and not before.position_inconsistent:
         monitors = replace(monitors, agreed=True)

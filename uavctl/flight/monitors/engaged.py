@@ -92,7 +92,7 @@ def update(
     return state, _select_first(first, wrong_response, unresolved, is_out, no_effect, no_answer)
 
 
-def shift_positions(state: MonitorState, change: DelayChange, at_ns: int) -> MonitorState:
+def shift_monitors(state: MonitorState, change: DelayChange, at_ns: int) -> MonitorState:
     """Move what was estimated of positions in a tick, as if they had come so; velocities are compared anew."""
     motion = state.motion
     if motion.observer is not None:
