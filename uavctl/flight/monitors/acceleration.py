@@ -24,6 +24,7 @@ from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.event_codes import EventCode
+from uavctl.flight.limits import GRAVITY_MPS2
 from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.noise import LARGEST_STD_M
 from uavctl.flight.monitors.observation import MOTION_NS, describe_vector
@@ -40,7 +41,6 @@ HINT_RATIO = 0.4  # of the bound: above it, a difference of velocities counts at
 CLEAN_RATIO = 0.5  # of the bound: up to it, a position is clean
 # Of the bound: a push that inertial data show explains nothing up to it, and a strong push ends at it.
 PUSH_RATIO = 0.5
-GRAVITY_MPS2 = 9.81
 MIN_UP = 0.1  # vertical part of the thrust below which the vehicle lies on its side
 _COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
