@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from flight_rig import small_plant
 
-from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
+from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias, remove_drag_from_bias
 from uavctl.flight.fallback import (
+    NEAR_LIMIT_M,
+    RETREAT_MPS,
     Fallback,
     FallbackParameters,
     FallbackReason,
@@ -16,10 +20,12 @@ from uavctl.flight.fallback import (
     begin_fallback,
     compute_brake_accel,
     compute_return_accel,
+    find_retreat,
+    keep_from_limits,
     request_fallback,
     restart_hold,
 )
-from uavctl.flight.limits import ZERO
+from uavctl.flight.limits import AXES, ZERO
 from uavctl.records import ControlMode, Vec3
 
 S = 1_000_000_000
@@ -142,6 +148,33 @@ def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
 )
 def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Vec3, wanted: Vec3) -> None:
     assert compute_return_accel(off_m, velocity_mps) == pytest.approx(wanted, abs=1e-12)
+
+
+LOWER_M, UPPER_M = (-3.0, -2.0, -2.5), (3.0, 2.0, math.inf)
+NEAR = NEAR_LIMIT_M - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("position_m", "wanted"),
+    [
+        ((-3.0 + NEAR, 2.0 - NEAR, -2.5 + NEAR), (1.0, -1.0, 1.0)),
+        ((-3.0 + NEAR_LIMIT_M, 2.0 - NEAR_LIMIT_M, -2.5 + NEAR_LIMIT_M), (0.0, 0.0, 0.0)),
+        ((3.4, -2.4, 0.0), (-1.0, 1.0, 0.0)),  # beyond both limits
+        ((math.nan, 0.0, math.nan), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_near_a_limit_braking_ends_at_a_retreat_from_it(position_m: Vec3, wanted: Vec3) -> None:
+    assert find_retreat(position_m, LOWER_M, UPPER_M) == tuple(RETREAT_MPS * sign for sign in wanted)
+
+
+def test_between_two_near_limits_there_is_no_retreat() -> None:
+    assert find_retreat((0.0, 0.0, 0.0), (-0.4, -0.4, -math.inf), (0.4, 0.6, 0.4)) == (0.0, RETREAT_MPS, -RETREAT_MPS)
+
+
+def test_holding_accelerates_no_vehicle_to_a_limit_that_it_retreats_from() -> None:
+    accel_mps2 = (0.3, -0.2, 0.1)
+    assert keep_from_limits(accel_mps2, ZERO) == accel_mps2
+    assert keep_from_limits(accel_mps2, (RETREAT_MPS, RETREAT_MPS, -RETREAT_MPS)) == (0.3, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -291,3 +324,22 @@ def test_a_bias_counts_as_far_as_it_has_been_there_all_the_time_of_late() -> Non
     for after_ns, first_ns in ((3 * S - 1, 5 * S), (3 * S, 5 * S), (3 * S + 1, 6 * S)):
         later = remember_bias(((5 * S, (0.1,)), (6 * S, (0.2,))), 5 * S + after_ns, (0.3,))
         assert (later[0][0], later[-1]) == (first_ns, (5 * S + after_ns, (0.3,)))
+
+
+@pytest.mark.parametrize(
+    ("velocity_mps", "bias_mps2", "wanted"),
+    [
+        ((1.4, 0.0, 0.0), (-0.28, 0.0, 0.0), (0.0, 0.0, 0.0)),  # d = -c v: drag alone
+        ((1.4, -0.7, 0.0), (-0.28, 0.14, 0.0), (0.0, 0.0, 0.0)),
+        ((1.4, 0.0, 0.0), (-0.28, 0.1, 0.05), (0.0, 0.1, 0.05)),  # wind across the way
+        ((1.4, 0.0, 0.0), (0.28, 0.0, 0.0), (0.28, 0.0, 0.0)),  # wind along the way
+        ((0.0, 0.0, 0.0), (-0.28, 0.1, 0.0), (-0.28, 0.1, 0.0)),  # at rest all of it is wind
+        ((0.1, 0.0, 0.0), (-0.28, 0.0, 0.0), (-0.16, 0.0, 0.0)),  # more than the largest drag, 1.2 1/s
+    ],
+)
+def test_drag_is_no_bias_to_brake_against(velocity_mps: Vec3, bias_mps2: Vec3, wanted: Vec3) -> None:
+    """The input gives twice its acceleration, so the bias is half of it."""
+    plant = replace(small_plant(AXES), accel_per_input=np.full(3, 2.0))
+    bias = plant.to_input(bias_mps2)
+    rest = remove_drag_from_bias(tuple(bias.tolist()), velocity_mps, plant)
+    assert plant.to_accel(np.array(rest)) == pytest.approx(wanted, abs=1e-12)

@@ -254,6 +254,31 @@ def test_a_silence_is_braked_on_the_last_own_velocity_that_was_right(right_mps: 
 
 
 @pytest.mark.fault(94)
+@pytest.mark.parametrize("wind_mps2", [0.4, -0.4])
+def test_the_wind_since_the_own_velocity_was_right_counts(wind_mps2: float) -> None:
+    """The vehicle was at rest two seconds ago, and what is sent since then is the braking of this test alone."""
+    ours, last = controller(), 5 + make_controller().horizon + 1
+    inputs = make_inputs(range((last + 1) * TICKS), make_step_samples(range(5, last + 1), steps=last + 1))
+    state = make_initial_state()
+    for inp in inputs[: last * TICKS]:
+        state, _ = run_tick(state, inp, ours)
+    at_ns = inputs[last * TICKS].at_ns
+    right_mps = tuple(-v for v in state.monitors.engaged.motion.model_mps)
+    change = VelocityChangeState(
+        velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps, right_ns=at_ns - 2_000_000_000
+    )
+    engaged = replace(state.monitors.engaged, velocity_change=change)
+    biases = tuple((at_ns - after_ns, (wind_mps2,)) for after_ns in (2_500_000_000, 0))
+    fallback = replace(state.fallback, biases=biases, flown=Fallback(ControlMode.BRAKE, at_ns))
+    state = replace(state, monitors=replace(state.monitors, engaged=engaged), fallback=fallback)
+    state, output = run_tick(state, inputs[last * TICKS], ours)
+    assert state.mode is ControlMode.BRAKE and output.setpoint is not None
+    # a = -d - g d t
+    wanted = -wind_mps2 * (1.0 + 2.0 * ours.fallback.brake_gain_1ps)
+    assert output.setpoint.accel_mps2[0] == pytest.approx(wanted, abs=0.05)
+
+
+@pytest.mark.fault(94)
 @pytest.mark.parametrize("is_silent", [True, False])
 def test_where_velocities_point_against_each_other_fresh_positions_are_braked_on(is_silent: bool) -> None:
     ours, back = controller(), 5 + make_controller().horizon + 1

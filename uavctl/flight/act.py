@@ -15,9 +15,15 @@ import msgspec
 
 from uavctl.arrays import Array
 from uavctl.flight.context import FilterView, TickContext, expand_axes, read_position, read_velocity
-from uavctl.flight.decide import Decided, carries_estimate, find_braking_velocity, find_hold_accel
+from uavctl.flight.decide import (
+    Decided,
+    carries_estimate,
+    find_braking_velocity,
+    find_hold_accel,
+    find_retreat_velocity,
+)
 from uavctl.flight.estimator import FilterHistory, PendingInputs, drop_samples, note_input
-from uavctl.flight.fallback import Fallback, FallbackReason, compute_brake_accel, compute_return_accel
+from uavctl.flight.fallback import Fallback, FallbackReason, compute_brake_accel, compute_return_accel, keep_from_limits
 from uavctl.flight.kalman import read_capture_ns
 from uavctl.flight.limits import ZERO, limit_setpoint
 from uavctl.flight.measure import Measured
@@ -99,12 +105,15 @@ def _compute_yaw(state: ControlState, context: TickContext, decided: Decided) ->
 
 def _compute_fallback_accel(fallback: Fallback, context: TickContext, supervised: Supervised, decided: Decided) -> Vec3:
     """Compute the acceleration that the fallback wants [m/s²]."""
-    moving, _ = find_braking_velocity(context, supervised)
+    moving, _ = find_braking_velocity(fallback, decided.biases, context, supervised)
     brake = compute_brake_accel(fallback, context.at_ns, moving, context.controller.fallback)
     hold = find_hold_accel(fallback, decided.biases, context, supervised)
     back = find_return_accel(fallback, decided.hold_point_m, supervised.view, context.controller.plant)
     # a = a_brake + a_hold + a_return
-    return brake[0] + hold[0] + back[0], brake[1] + hold[1] + back[1], brake[2] + hold[2] + back[2]
+    wanted = brake[0] + hold[0] + back[0], brake[1] + hold[1] + back[1], brake[2] + hold[2] + back[2]
+    if fallback.mode is not ControlMode.HOLD:
+        return wanted
+    return keep_from_limits(wanted, find_retreat_velocity(fallback, context, supervised.view))
 
 
 def find_return_accel(fallback: Fallback, hold_point_m: Vec3 | None, view: FilterView, plant: Plant) -> Vec3:

@@ -20,7 +20,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.arrays import Array
-from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
+from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias, remove_drag_from_bias
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import make_estimate, select_covariance
@@ -29,6 +29,7 @@ from uavctl.flight.fallback import (
     FallbackReason,
     advance_fallback,
     begin_fallback,
+    find_retreat,
     request_fallback,
     restart_hold,
 )
@@ -167,7 +168,9 @@ def _update_biases(phase: _Phase) -> Biases:
         return biases if phase.state.fallback.flown is not None else ()
     if not context.is_boundary or view.age_steps or view.estimate is None or not view.estimate.bias:
         return biases
-    return remember_bias(biases, context.boundary_ns, view.estimate.bias)
+    plant = context.controller.plant
+    bias = remove_drag_from_bias(view.estimate.bias, read_velocity(view.estimate, plant), plant)
+    return remember_bias(biases, context.boundary_ns, bias)
 
 
 def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
@@ -381,7 +384,7 @@ def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Deci
 def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     """Advance the fallback to this tick."""
     state, context, view = phase.state, phase.context, phase.view
-    moving, measured = find_braking_velocity(context, phase.supervised)
+    moving, measured = find_braking_velocity(fallback, draft.biases, context, phase.supervised)
     is_predicted = not (measured or carries_estimate(fallback, view.belief))
     return advance_fallback(
         fallback,
@@ -433,13 +436,32 @@ def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, su
     return north, east, down
 
 
-def find_braking_velocity(context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
-    """Find the velocity to brake on, and whether it is the vehicle's own.
+def find_retreat_velocity(fallback: Fallback, context: TickContext, view: FilterView) -> Vec3:
+    """Find the velocity [m/s] at which a vehicle that brakes or holds retreats from walls and ceiling near to it."""
+    bounds = context.controller.envelope
+    if view.estimate is None or bounds is None or fallback.reason is FallbackReason.POSITIONS_DISTRUSTED:
+        return ZERO
+    north, east, _ = bounds.upper_m  # the floor is no limit to retreat from
+    position_m = read_position(view.estimate, context.controller.plant, math.nan)
+    return find_retreat(position_m, bounds.lower_m, (north, east, math.inf))
+
+
+def find_braking_velocity(
+    fallback: Fallback, biases: Biases, context: TickContext, supervised: Supervised
+) -> tuple[Vec3, bool]:
+    """Find the velocity to brake on, beside that of a retreat from limits, and whether it is the vehicle's own."""
+    velocity, is_own = _find_velocity(biases, context, supervised)
+    retreat = find_retreat_velocity(fallback, context, supervised.view)
+    return (velocity[0] - retreat[0], velocity[1] - retreat[1], velocity[2] - retreat[2]), is_own
+
+
+def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
+    """Find the velocity of a vehicle that brakes, and whether it is the vehicle's own.
 
     Else it is the predicted one. Where both point against each other, one of them is wrong, and would accelerate the
     vehicle: then it is the one that recent positions show, or their mean where inertial data carry the prediction on.
     Where only setpoints do, and the own velocity was right until a moment ago, it is that velocity and what setpoints
-    have changed since: it is newer than the last position.
+    and the lasting bias have changed since: it is newer than the last position.
     """
     estimate, plant, monitors = supervised.view.estimate, context.controller.plant, supervised.monitors.engaged
     predicted, belief = read_velocity(estimate, plant), supervised.view.belief
@@ -453,11 +475,15 @@ def find_braking_velocity(context: TickContext, supervised: Supervised) -> tuple
             elif _is_inertial_new(belief):
                 own = _select_known([0.5 * (v + known) for v, known in zip(own, predicted, strict=True)], plant)
         return own, True
-    right = monitors.velocity_change.right_beside_model_mps
+    change, bias = monitors.velocity_change, find_lasting_bias(biases)
+    right = change.right_beside_model_mps
     if right is None or _is_inertial_new(belief) or not are_positions_lost(belief, context.at_ns):
         return predicted, False
-    # v = (v_0 - m_0) + m
-    return _select_known([v + m for v, m in zip(right, monitors.motion.model_mps, strict=True)], plant), False
+    wind_mps2 = plant.to_accel(np.array(bias)) if bias else ZERO
+    s = (context.at_ns - (change.right_ns or context.at_ns)) * 1e-9
+    # v = (v_0 - m_0) + m + d t
+    rows = zip(right, monitors.motion.model_mps, wind_mps2, strict=True)
+    return _select_known([v + m + d * s for v, m, d in rows], plant), False
 
 
 def _select_known(velocity_mps: Sequence[float], plant: Plant) -> Vec3:

@@ -19,8 +19,11 @@ A state machine of four modes, each with a time limit:
    By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold runs on.
 2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. By a
    prediction from inputs alone the vehicle brakes only until that is slow.
-3. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.
-4. The way back to TRACK, from BRAKE and HOLD with reason RECOVER only, is decided at Δt boundaries
+3. Near to a wall or the ceiling, braking ends at a slow retreat from it, and HOLD accelerates against it in no case:
+   without positions the vehicle drifts, and how far it is from the limit is not known well. Positions that are
+   distrusted show no limit to retreat from.
+4. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.
+5. The way back to TRACK, from BRAKE and HOLD with reason RECOVER only, is decided at Δt boundaries
    (`uavctl.flight.decide`).
 """
 
@@ -40,6 +43,9 @@ OPEN_LOOP_STILL_MPS = 0.1
 DRIFT_MPS = 0.15  # above this speed, by its own velocity, a vehicle that holds drifts
 CALM_MPS2 = 0.04  # HOLD begins when the setpoint is this close to its own
 RETURN_GAIN_1PS2, RETURN_GAIN_1PS = 1.0, 1.5  # gains of distance and speed on the way back: two seconds
+# So near to a limit a vehicle brakes to a slow retreat, and holds without acceleration to the limit. Without positions
+# the estimate may be off by as much.
+NEAR_LIMIT_M, RETREAT_MPS = 0.5, 0.15
 RETURN_MPS2 = 1.0  # largest acceleration in any axis on the way back: the estimate may be wrong
 
 
@@ -180,6 +186,23 @@ def compute_return_accel(off_m: Vec3, velocity_mps: Vec3) -> Vec3:
 
 def _limit_return(accel_mps2: float) -> float:
     return min(max(accel_mps2, -RETURN_MPS2), RETURN_MPS2) if math.isfinite(accel_mps2) else 0.0
+
+
+def find_retreat(position_m: Vec3, lower_m: Vec3, upper_m: Vec3) -> Vec3:
+    """Find the velocity [m/s] away from the limits that the estimated position is near to; zero in other axes."""
+    north, east, down = (
+        RETREAT_MPS * ((position - lower < NEAR_LIMIT_M) - (upper - position < NEAR_LIMIT_M))
+        for position, lower, upper in zip(position_m, lower_m, upper_m, strict=True)
+    )
+    return north, east, down
+
+
+def keep_from_limits(accel_mps2: Vec3, retreat_mps: Vec3) -> Vec3:
+    """Remove from the acceleration of HOLD [m/s²] what points against the retreat from limits."""
+    north, east, down = (
+        0.0 if accel * retreat < 0.0 else accel for accel, retreat in zip(accel_mps2, retreat_mps, strict=True)
+    )
+    return north, east, down
 
 
 def _follow_hold(reason: FallbackReason, land: bool) -> ControlMode:

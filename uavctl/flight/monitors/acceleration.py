@@ -70,7 +70,7 @@ def update(state: AccelerationState, observation: PositionObservation) -> tuple[
     if observation.begins:
         return replace(state, ratio=0.0, clipped=(), over_ns=None), NO_VERDICT
     observer, bound_mps2 = observation.observer, observation.parameters.unexplained_mps2
-    unexplained = remove_drag(observer.mean)
+    unexplained = remove_drag(observer.mean[2], observer.mean[1])
     beside_sent_mps2 = measure_size_mps2(unexplained)
     is_pushed, beside_mps2 = _explain_push(state, observation.motion, beside_sent_mps2, bound_mps2)
     ratio = beside_mps2 / bound_mps2
@@ -102,7 +102,7 @@ def _explain_push(
         return state.is_pushed, beside_sent_mps2
     if not measure_size_mps2(motion.push_mps2) > PUSH_RATIO * bound_mps2:
         return False, beside_sent_mps2
-    beside_mps2 = min(beside_sent_mps2, measure_size_mps2(remove_drag(observer.inertial)))
+    beside_mps2 = min(beside_sent_mps2, measure_size_mps2(remove_drag(observer.inertial[2], observer.inertial[1])))
     return beside_sent_mps2 > (PUSH_RATIO if state.is_pushed else 1.0) * bound_mps2 >= beside_mps2, beside_mps2
 
 

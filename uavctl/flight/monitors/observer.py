@@ -200,11 +200,10 @@ def measure_size_mps2(accel_mps2: Array | Vec3) -> float:
     return max(math.hypot(accel_mps2[0], accel_mps2[1]), abs(float(accel_mps2[2])))
 
 
-def remove_drag(mean: Array) -> Array:
-    """Return the unexplained acceleration (3,) without the part that can be drag, by the mean of an observer."""
-    _, velocity, unexplained = mean
+def remove_drag(accel_mps2: Array, velocity_mps: Array) -> Array:
+    """Return an unexplained acceleration (3,) without the part that can be drag at a velocity (3,)."""
     # c = -d' v / v' v, within [0, c_max]; d + c v
-    along = float(velocity.dot(velocity))
-    drag_1ps = min(max(-float(unexplained.dot(velocity)) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
-    rest: Array = unexplained + drag_1ps * velocity
+    along = float(velocity_mps.dot(velocity_mps))
+    drag_1ps = min(max(-float(accel_mps2.dot(velocity_mps)) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
+    rest: Array = accel_mps2 + drag_1ps * velocity_mps
     return rest

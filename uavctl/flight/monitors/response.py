@@ -200,7 +200,7 @@ def _is_witnessed(observation: TickObservation) -> bool:
     if tick.at_ns - observer.at_ns > SILENT_NS:
         return False
     beside_sent_mps2, beside_inertial_mps2 = (
-        measure_size_mps2(remove_drag(mean)) for mean in (observer.mean, observer.inertial)
+        measure_size_mps2(remove_drag(mean[2], mean[1])) for mean in (observer.mean, observer.inertial)
     )
     shown_mps2 = WITNESSED_PART * observation.parameters.unexplained_mps2
     return beside_sent_mps2 > max(shown_mps2, 2.0 * beside_inertial_mps2)

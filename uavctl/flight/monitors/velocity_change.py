@@ -60,6 +60,7 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
     # The last own velocity that was right, less the model's then [m/s]; None while the own velocity is right
     right_beside_model_mps: Vector | None = None
+    right_ns: int | None = None  # its time [ns]
 
     @property
     def has_found_wrong(self) -> bool:
@@ -139,7 +140,7 @@ def _compare(
             return supported
         if state.velocity_wrong_ns is not None:
             return state
-        return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps)
+        return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps, right_ns=first[0])
     disagrees_ns = at_ns if state.disagrees_ns is None else state.disagrees_ns
     if at_ns - disagrees_ns < PERSISTS_NS:
         return replace(state, disagrees_ns=disagrees_ns)
@@ -154,6 +155,7 @@ def _compare(
         velocity_wrong_ns=at_ns if is_velocity_wrong else None,
         inertial_wrong_ns=at_ns if are_both_wrong or own_mps < gained_mps else None,
         right_beside_model_mps=right_mps if is_velocity_wrong else None,
+        right_ns=first[0] if is_velocity_wrong else None,
     )
 
 
@@ -181,7 +183,8 @@ def _judge_alone(
         state = replace(state, repeated=shown)
     if not is_wrong or state.velocity_wrong_ns is not None:
         return state
-    return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=_subtract(before, model_before))
+    right_mps = _subtract(before, model_before)
+    return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps, right_ns=before_ns)
 
 
 def _believe_again(
@@ -196,7 +199,7 @@ def _believe_again(
     if not velocity.offsets or velocity.offsets[0][0] <= velocity_ns:
         return state
     if velocity.apart_mps <= parameters.disagreement_mps:
-        state = replace(state, velocity_wrong_ns=None, samples=(), right_beside_model_mps=None)
+        state = replace(state, velocity_wrong_ns=None, samples=(), right_beside_model_mps=None, right_ns=None)
     return state
 
 
