@@ -236,6 +236,30 @@ def test_a_velocity_found_wrong_in_a_silence_ends_the_flight_on_plans(is_wrong: 
 
 
 @pytest.mark.fault(94)
+@pytest.mark.parametrize("is_wrong", [True, False])
+@pytest.mark.parametrize("repeats_s", [0.5, 3.0])
+def test_a_velocity_that_was_found_wrong_and_repeats_ends_the_flight_beside_positions(
+    is_wrong: bool, repeats_s: float
+) -> None:
+    ours, inputs = controller(), make_inputs(range(3 * TICKS), make_step_samples(steps=3))
+    state = make_initial_state()
+    for inp in inputs[:-1]:
+        state, _ = run_tick(state, inp, ours)
+    inp, shown_mps = inputs[-1], (0.5, 0.0, 0.0)
+    since_ns = inp.at_ns - round(repeats_s * 1e9)
+    found = VelocityChangeState(
+        velocity_wrong_ns=inp.at_ns if is_wrong else None, repeated=(shown_mps, shown_mps, since_ns)
+    )
+    engaged = replace(state.monitors.engaged, velocity_change=found)
+    braking = replace(state.fallback, flown=Fallback(ControlMode.BRAKE, inp.at_ns))
+    state = replace(state, monitors=replace(state.monitors, engaged=engaged), fallback=braking)
+    state, _ = run_tick(state, replace(inp, motion=motion(shown_mps, inp.at_ns)), ours)
+    assert state.fallback.flown is not None
+    wanted = FallbackReason.VELOCITY_WRONG if is_wrong and repeats_s > 1.0 else FallbackReason.RECOVER
+    assert state.fallback.flown.reason is wanted
+
+
+@pytest.mark.fault(94)
 @pytest.mark.parametrize("right_mps", [2.0, -2.0])
 def test_a_silence_is_braked_on_the_last_own_velocity_that_was_right(right_mps: float) -> None:
     ours, last = controller(), 5 + make_controller().horizon + 1

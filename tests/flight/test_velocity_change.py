@@ -15,7 +15,7 @@ from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import Motion, TickObservation, update_motion
 from uavctl.flight.monitors.observer import InertialSpan, Observer
 from uavctl.flight.monitors.velocity import CORRECTS_NS, VelocityState
-from uavctl.flight.monitors.velocity_change import VelocityChangeState, update
+from uavctl.flight.monitors.velocity_change import REPEATS_NS, VelocityChangeState, update
 from uavctl.records import Vec3
 
 TICK_NS = 50 * MS
@@ -175,6 +175,28 @@ def test_no_velocity_is_kept_while_the_own_one_is_right() -> None:
     (state,) = fly(1, true, true, state=wrong, velocity=positions)
     assert state.right_beside_model_mps is None
     assert {one.right_beside_model_mps for one in fly(40, true, true)} == {None}
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("shown", ["repeats", "moves"])
+def test_positions_that_agree_make_no_velocity_right_that_repeats(shown: str) -> None:
+    """The first position counts that came after the velocity was found wrong, and it agrees."""
+    positions, wrong = VelocityState(offsets=((START_NS + 1, ZERO),), apart_mps=0.0), VelocityChangeState()
+    wrong = structs.replace(wrong, velocity_wrong_ns=START_NS)
+    ticks = round(REPEATS_NS / TICK_NS) + 4
+    *_, last = fly(ticks, lambda _s, v: 1.0 if shown == "repeats" else v, true, state=wrong)
+    assert last.velocity_wrong_ns is not None
+    at_ns = START_NS + (ticks - 1) * TICK_NS
+    assert last.repeats(at_ns) == (shown == "repeats")
+    seen_again = seen(at_ns, sent=ACCEL, vehicle_motion=motion(north(1.0), at_ns))
+    after = update(last, TickObservation(seen_again, AT_FIRST, PARAMETERS), positions)
+    assert (after.velocity_wrong_ns is None) == (shown == "moves")
+
+
+def test_a_velocity_repeats_once_it_has_for_longer_than_any_message_takes() -> None:
+    state = VelocityChangeState(repeated=(ZERO, ZERO, START_NS))
+    assert [state.repeats(START_NS + REPEATS_NS + after_ns) for after_ns in (0, 1)] == [False, True]
+    assert not VelocityChangeState().repeats(START_NS)
 
 
 def test_nothing_is_compared_while_positions_correct_the_velocity() -> None:

@@ -56,7 +56,7 @@ COMPARED_NS = CORRECTS_NS + 400_000_000
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL_TEXTS = {
-    FallbackReason.VELOCITY_WRONG: "no position came, and the vehicle's own velocity was found wrong",
+    FallbackReason.VELOCITY_WRONG: "the vehicle's own velocity was found wrong, and it repeats, or no position came",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
     FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
     FallbackReason.ENVELOPE: "what is seen cannot be",
@@ -400,10 +400,12 @@ def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
 
 
 def _is_velocity_wrong(phase: _Phase) -> bool:
-    """Whether no position comes, and the vehicle's own velocity was found wrong."""
-    supervised = phase.supervised
-    is_wrong = supervised.monitors.engaged.velocity_change.velocity_wrong_ns is not None
-    return is_wrong and are_positions_lost(supervised.view.belief, phase.context.at_ns)
+    """Whether the vehicle's own velocity was found wrong, and no position comes, or it does nothing but repeat."""
+    supervised, at_ns = phase.supervised, phase.context.at_ns
+    change = supervised.monitors.engaged.velocity_change
+    if change.velocity_wrong_ns is None:
+        return False
+    return change.repeats(at_ns) or are_positions_lost(supervised.view.belief, at_ns)
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:

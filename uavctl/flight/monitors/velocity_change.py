@@ -39,6 +39,7 @@ INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degre
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 LEAST_S = 0.5  # over less, setpoints alone say nothing of an own velocity
 RECENT_NS = 300_000_000  # an agreement counts for so long
+REPEATS_NS = 1_000_000_000  # a velocity that comes twice a second has changed by then, at the least
 # Leap from one message to the next: a disagreement, and what a turned response makes of usual setpoints. Where
 # inertial data were found wrong, nothing else checks the own velocity. Flights without a lie, recorded ones of real
 # autopilots included, stayed 0.2 m/s below the second bound.
@@ -71,6 +72,10 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     def contradicts(self) -> bool:
         """Whether both changes contradict each other, or one of them was found wrong."""
         return self.has_found_wrong or self.disagrees_ns is not None
+
+    def repeats(self, at_ns: int) -> bool:
+        """Whether the own velocity has repeated to the last bit for longer than any message takes."""
+        return self.repeated is not None and at_ns - self.repeated[2] > REPEATS_NS
 
     def supports_velocity(self, at_ns: int) -> bool:
         """Whether inertial data, or setpoints without right ones, have changed as the own velocity has, just now."""
@@ -198,7 +203,7 @@ def _believe_again(
         return state
     if not velocity.offsets or velocity.offsets[0][0] <= velocity_ns:
         return state
-    if velocity.apart_mps <= parameters.disagreement_mps:
+    if velocity.apart_mps <= parameters.disagreement_mps and not state.repeats(at_ns):
         state = replace(state, velocity_wrong_ns=None, samples=(), right_beside_model_mps=None, right_ns=None)
     return state
 
