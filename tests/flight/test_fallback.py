@@ -334,7 +334,9 @@ def test_a_bias_counts_as_far_as_it_has_been_there_all_the_time_of_late() -> Non
         ((1.4, 0.0, 0.0), (-0.28, 0.1, 0.05), (0.0, 0.1, 0.05)),  # wind across the way
         ((1.4, 0.0, 0.0), (0.28, 0.0, 0.0), (0.28, 0.0, 0.0)),  # wind along the way
         ((0.0, 0.0, 0.0), (-0.28, 0.1, 0.0), (-0.28, 0.1, 0.0)),  # at rest all of it is wind
-        ((0.1, 0.0, 0.0), (-0.28, 0.0, 0.0), (-0.16, 0.0, 0.0)),  # more than the largest drag, 1.2 1/s
+        ((0.5, 0.0, 0.0), (-0.8, 0.0, 0.0), (-0.2, 0.0, 0.0)),  # more than the largest drag, 1.2 1/s
+        ((0.3, 0.0, 0.0), (-0.06, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((0.29, 0.0, 0.0), (-0.06, 0.0, 0.0), (-0.06, 0.0, 0.0)),  # it stands
     ],
 )
 def test_drag_is_no_bias_to_brake_against(velocity_mps: Vec3, bias_mps2: Vec3, wanted: Vec3) -> None:

@@ -7,6 +7,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from uavctl.flight.monitors.observer import remove_drag
@@ -17,6 +19,7 @@ from uavctl.smpc.plant import Plant
 # what is flown. Its acceleration would be flown for seconds without a position.
 LASTING_NS = 2_000_000_000  # a bias counts that has been estimated for so long,
 RECENT_NS = 3_000_000_000  # as far as all estimates of this time have it
+MOVES_MPS = 0.3  # below it drag is less than an estimated bias is off
 
 Biases = tuple[tuple[int, Vector], ...]  # (time [ns], estimated bias (n_u,)), oldest first
 
@@ -27,7 +30,9 @@ def remember_bias(biases: Biases, at_ns: int, bias: Vector) -> Biases:
 
 
 def remove_drag_from_bias(bias: Vector, velocity_mps: Vec3, plant: Plant) -> Vector:
-    """Return a bias (n_u,) without the part that can be drag at the velocity."""
+    """Return a bias (n_u,) without the part that can be drag at the velocity, if the vehicle moves at all."""
+    if math.hypot(*velocity_mps) < MOVES_MPS:
+        return bias
     rest = remove_drag(np.array(plant.to_accel(np.array(bias))), np.array(velocity_mps))
     north, east, down = rest.tolist()
     return tuple(plant.to_input((north, east, down)).tolist())
