@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Self
 
 import msgspec
@@ -170,15 +170,16 @@ def read_design(header: Header) -> DesignView:
         view = msgspec.convert(header.design, DesignView)
     except msgspec.ValidationError as error:
         raise RecordingError(f"the header's design cannot be used: {error}") from error
-    free = _get_free_input(header)
+    free = _get_free_input(header.config_toml)
     sides = tuple(b + free * sum(map(abs, row)) for row, b in zip(view.c_u, view.b_u, strict=True))
     return msgspec.structs.replace(view, b_u=sides)
 
 
-def _get_free_input(header: Header) -> float:
+@lru_cache(4)  # a flight is read several times: for its figures, page and tables
+def _get_free_input(config_toml: str) -> float:
     """Return how much of each input plans leave free to act against a bias [input units]."""
     try:
-        estimator = parse_stored_toml(header.config_toml, "configuration").get("estimator", {})
+        estimator = parse_stored_toml(config_toml, "configuration").get("estimator", {})
     except ConfigError:
         return 0.0  # the page shows the damaged text, and limits that are cautious
     return float(estimator.get("bias_max", 0.0))

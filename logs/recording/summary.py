@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -89,7 +90,7 @@ def compute_limits(flight: FlightData, t_s: Array) -> Array:
     """Return the right sides of the state set's rows (n, m_x) at report times (n,) [s]."""
     design, begun_s = flight.design, flight.targets[0][0]
     limits = np.tile(np.array(design.b_x), (len(t_s), 1))
-    for fence in _read_fences(flight):
+    for fence in _read_fences(flight.header.config_toml):
         state, box = fence.state, design.state_box
         if isinstance(state, str):
             state = design.position_index[design.axes.index(state)]
@@ -113,13 +114,14 @@ def compute_box(flight: FlightData, t_s: Array) -> tuple[Array, Array]:
     return sides[0], sides[1]
 
 
-def _read_fences(flight: FlightData) -> Iterator[FenceConfig]:
-    """Return the fences of the flight's configuration; none if it cannot be read any more."""
+@lru_cache(4)  # a page asks for the limits a dozen times
+def _read_fences(config_toml: str) -> tuple[FenceConfig, ...]:
+    """Return the fences of a flight's configuration; none if it cannot be read any more."""
     try:
-        fences = parse_stored_toml(flight.header.config_toml, "configuration").get("fence", [])
-        yield from msgspec.convert(fences, tuple[FenceConfig, ...])
+        fences = parse_stored_toml(config_toml, "configuration").get("fence", [])
+        return msgspec.convert(fences, tuple[FenceConfig, ...])
     except (ConfigError, msgspec.ValidationError):
-        return
+        return ()
 
 
 RELATIVE_TOLERANCE = 1e-9
