@@ -24,7 +24,7 @@ test-all: $(STAMP)
 
 # Types the commands of the manual's pages as a reader would, in real time, against simulated vehicles.
 test-manual: $(STAMP)
-	$(VENV)/bin/python -m pytest -n 0 -m manual tests/e2e/test_manual.py
+	$(VENV)/bin/python -m pytest -n 2 --dist loadgroup -m manual tests/e2e/test_manual.py
 
 test-clients: $(STAMP) $(CLIENTS)/.installed
 	UAVCTL_MAVSDK_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk/bin/python \

@@ -60,6 +60,9 @@ TIMED_ITEMS = [
     "vehicle clock",
     "source clock",
 ]
+# Flights in real time follow each other; pages of commands run beside them, with less of the processor.
+IN_REAL_TIME = pytest.mark.xdist_group("real time")
+BESIDE = ("nice", "-n", "5")
 READER_S = 3.0  # a reader watches the vehicle after an order; `identify` needs 5 s of flight
 TIMEOUTS = ["COM_OF_LOSS_T", "GUID_TIMEOUT"]
 LONG_TIMEOUT = "--set sim.setpoint_timeout_s=600.0"
@@ -79,6 +82,19 @@ def is_run(command: str) -> bool:
     return not any(re.search(pattern, command) for pattern in OMITTED)
 
 
+def list_commands() -> dict[str, list[str]]:
+    """What is typed for the pages without a test of their own; a command of several pages is typed once."""
+    pages = [page for page in PAGES if page not in PAGES_WITH_OWN_TEST]
+    first_pages: dict[str, str] = {}
+    for page in pages:
+        for command in filter(is_run, find_commands(page)):
+            first_pages.setdefault(shorten_command(command), page)
+    return {page: [command for command, first in first_pages.items() if first == page] for page in pages}
+
+
+COMMANDS = list_commands()
+
+
 @pytest.fixture
 def shell(tmp_path: Path) -> Iterator[ManualShell]:
     with open_shell(tmp_path) as shell:
@@ -90,6 +106,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files that pages take for granted: flights by the names that they have there, other people's recordings."""
     folder = tmp_path_factory.mktemp("flown")
     with open_shell(tmp_path_factory.mktemp("desk")) as shell:
+        shell.prefix = (*BESIDE, *shell.prefix)
         waypoints = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-0.8],[1.5,-1.0,-1.4]]"
         flight = f"uavctl loopback --config room-px4 --duration 40 --out flights/NAME --set '{waypoints}'"
         shell.run(flight)
@@ -113,23 +130,22 @@ def test_the_tables_name_commands_of_the_manual() -> None:
 
 
 @pytest.mark.manual
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if page not in PAGES_WITH_OWN_TEST and any(map(is_run, find_commands(page)))]
-)
+@pytest.mark.parametrize("page", [page for page, commands in COMMANDS.items() if commands])
 def test_the_commands_of_a_page_succeed(page: str, shell: ManualShell, flown: Path) -> None:
+    shell.prefix = (*BESIDE, *shell.prefix)
     shutil.copytree(flown, shell.folder, dirs_exist_ok=True)
-    for command in filter(is_run, find_commands(page)):
+    for command in COMMANDS[page]:
         if re.match(r"uavctl init ", command):
             (shell.folder / "my-room.toml").unlink()
         if re.match(r"uavctl fly ", command):
             if page == "README.md":  # it flies what stands there
                 shell.wait_for_text(shell.start("uavctl sim --config my-room.toml"), "system_id")
-            flight = shell.start(shorten_command(command))
+            flight = shell.start(command)
             shell.wait_for_success("uavctl ctl status")
             shell.stop(flight)
             assert flight.returncode == 1, shell.read_output(flight)  # nobody switched to it: nothing was flown
         else:
-            shell.run(shorten_command(command))
+            shell.run(command)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in TOML_OF_OTHERS and find_blocks(page, "toml")])
@@ -157,6 +173,7 @@ AUTOPILOTS = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760
 
 
 @pytest.mark.manual
+@IN_REAL_TIME
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShell) -> None:
     def on_page(section: str) -> list[str]:
@@ -199,6 +216,7 @@ def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShel
 
 
 @pytest.mark.manual
+@IN_REAL_TIME
 def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
     page = "docs/fleet.md"
     (sim,) = find_commands(page, "Try it")
@@ -219,6 +237,7 @@ def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
 
 
 @pytest.mark.manual
+@IN_REAL_TIME
 def test_the_orders_of_the_page_succeed(shell: ManualShell) -> None:
     shell.wait_for_text(shell.start(f"uavctl sim --config room-px4 {LONG_TIMEOUT}"), "system_id")
     accepted = f"--set 'check.accept={json.dumps(TIMED_ITEMS + TIMEOUTS)}'"

@@ -68,7 +68,7 @@ class ManualShell:
     """Shell in a folder like a checkout, with a network of its own; without the right to one it locks the ports."""
 
     folder: Path
-    network: tuple[str, ...]
+    prefix: tuple[str, ...]
     environment: dict[str, str]
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
@@ -76,7 +76,7 @@ class ManualShell:
         """Start a command."""
         log = (self.folder / f"log-{len(self.processes)}").open("wb")
         process = subprocess.Popen(
-            [*self.network, "sh", "-c", f"exec {command}" if command.startswith("uavctl ") else command],
+            [*self.prefix, "sh", "-c", f"exec {command}" if command.startswith("uavctl ") else command],
             cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
         )  # fmt: skip
         log.close()
