@@ -39,7 +39,7 @@ from uavctl.config import load_config
 from uavctl.daemon import control_socket
 from uavctl.daemon.daemon import fly
 from uavctl.daemon.health import HealthMonitor
-from uavctl.daemon.lock import find_lock_paths
+from uavctl.daemon.lock import find_lock_paths, lock_vehicle
 from uavctl.daemon.notifier import Notifier
 from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
@@ -205,8 +205,8 @@ def read_page_text(page: Path) -> str:
 class EndingReport:
     """Ending of a flight as console, page, status, recording and JSON report it."""
 
-    def __init__(self, rig: EndingRig, code: int, out: str, err: str) -> None:
-        self.code = code
+    def __init__(self, rig: EndingRig, code: int, out: str, err: str, *, is_left_in_flight: bool) -> None:
+        self.code, self.is_left_in_flight = code, is_left_in_flight
         self.summary: dict[str, Any] = json.loads(out) if out else {}
         self.console = " ".join(err.split())
         self.path = rig.folder / "flight.mcap"
@@ -305,12 +305,15 @@ def fly_command(rig: EndingRig, capsys: pytest.CaptureFixture[str], *arguments: 
             code = run(["fly", *PRESET, *sets, *places, "--control", control, *arguments])
     except SystemExit as ended:
         code = int(ended.code or 0)
+    try:
+        with lock_vehicle(url) as tenure:  # it is free again
+            is_left_in_flight = tenure.is_left_in_flight
     finally:
         for path in find_lock_paths(url):
             path.unlink(missing_ok=True)
     out, err = capsys.readouterr()
     assert (rig.folder / "flight.mcap").exists(), err
-    return EndingReport(rig, code, out, err)
+    return EndingReport(rig, code, out, err, is_left_in_flight=is_left_in_flight)
 
 
 def is_message(kind: str) -> Callable[[bytes], bool]:
