@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tune_rig import BOX, START, make_arguments, run_command, short_flights
 
@@ -30,6 +31,7 @@ from uavctl.cli.tune_run import (
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import UsageError
+from uavctl.lab.identify.history import FlightHistory
 from uavctl.lab.identify.result import Identification, identify
 from uavctl.lab.tune.excitation import parse_box
 
@@ -39,24 +41,41 @@ PILOT = 'sim.fault=[{at_s=6.0,kind="mode",name="POSCTL"}]'
 
 
 @pytest.fixture(scope="module")
-def identified() -> list[Identification]:
-    """What the whole run identified."""
+def identified() -> list[tuple[FlightHistory, Identification]]:
+    """History that the whole run identified, and the result."""
     return []
 
 
 @pytest.fixture(scope="module")
-def finished_run(tmp_path_factory: pytest.TempPathFactory, identified: list[Identification]) -> Path:
+def finished_run(
+    tmp_path_factory: pytest.TempPathFactory, identified: list[tuple[FlightHistory, Identification]]
+) -> Path:
     """A whole run, its recordings in several files."""
     folder = tmp_path_factory.mktemp("tune") / "run"
 
-    def keep(*given: Any) -> Identification:
-        identified.append(identify(*given))
-        return identified[-1]
+    def keep(history: FlightHistory, *given: Any) -> Identification:
+        identified.append((history, identify(history, *given)))
+        return identified[-1][1]
 
     with short_flights(has_figures=True), pytest.MonkeyPatch.context() as patch:
         patch.setattr(tune_run, "identify", keep)
         assert run(make_arguments(folder, *OURS)) == 0
     return folder
+
+
+@pytest.fixture
+def identified_before(
+    finished_run: Path, identified: list[tuple[FlightHistory, Identification]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flight of the whole run is identified already; another one fails the test."""
+    ((flown, identification),) = identified
+
+    def find(history: FlightHistory, *_: Any) -> Identification:
+        assert np.array_equal(history.positions.times_s, flown.positions.times_s)
+        assert np.array_equal(history.positions.positions_m, flown.positions.positions_m)
+        return identification
+
+    monkeypatch.setattr(tune_run, "identify", find)
 
 
 @pytest.fixture
@@ -127,15 +146,10 @@ def test_a_run_that_is_done_flies_no_more(finished_run: Path, capsys: pytest.Cap
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("no_flight")
+@pytest.mark.usefixtures("no_flight", "identified_before")
 def test_complete_flights_count_without_the_rest(
-    finished_run: Path,
-    identified: list[Identification],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(tune_run, "identify", lambda *_: identified[0])
     folder = tmp_path / "copy"
     shutil.copytree(finished_run, folder)
     for name in (TUNED_FILE, PAGE_FILE):
@@ -201,6 +215,7 @@ def test_ctrl_c_ends_the_flight_and_the_run(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("identified_before")
 def test_a_recording_takes_the_place_of_the_first_flight(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
