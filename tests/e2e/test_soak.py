@@ -74,7 +74,8 @@ def test_a_px4_that_receives_no_order_in_the_climb_is_found_hovering(monkeypatch
         return any(getattr(message, "command", 0) in (SET_MODE, LAND) for message in decode(data))
 
     monkeypatch.setattr("soak_take_off.make_troubled_rig", deaf)
-    monkeypatch.setattr("soak_take_off.LANDING_S", 30.0)
+    monkeypatch.setattr("soak_take_off.LIMIT_S", 25.0)
+    monkeypatch.setattr("soak_take_off.LANDING_S", 10.0)
     result = fly_take_off("px4", 1)
     (flight,) = flights
     assert flight.peers.autopilot.mode_name == "AUTO.TAKEOFF"
