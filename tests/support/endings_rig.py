@@ -210,7 +210,8 @@ class EndingReport:
         self.summary: dict[str, Any] = json.loads(out) if out else {}
         self.console = " ".join(err.split())
         self.path = rig.folder / "flight.mcap"
-        self.records = [record for _, _, record in read(self.path)]
+        self.entries = list(read(self.path))
+        self.records = [record for _, _, record in self.entries]
         self.recorded_endings = [record for record in self.records if isinstance(record, Ending)]
         page = self.path.with_suffix(".html")
         self.page = read_page_text(page) if page.exists() else ""
@@ -236,7 +237,7 @@ class EndingReport:
         assert self.ending["exit_code"] == self.code == (0 if self.ending["as_ordered"] else 1)
         assert self.ending["cause"] == self.summary["ended"]
         assert [ending.sentence for ending in self.recorded_endings] == [sentence]
-        again = summarise(FlightData.from_records(read(self.path)), wall_s=None)
+        again = summarise(FlightData.from_records(self.entries), wall_s=None)
         assert (again.ending.sentence, again.ending.exit_code) == (sentence, self.code)
 
     def _assert_relay_agreement(self) -> None:

@@ -138,6 +138,7 @@ def make_page_data(memory: MemorySink) -> FlightData:
     return FlightData.from_records(memory.entries)
 
 
+@cache
 def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
     """Return the vehicle statuses that a link parses, with times since the first packet [s]."""
     whole = packets(name)

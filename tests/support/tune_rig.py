@@ -44,9 +44,11 @@ def make_arguments(folder: Path, *more: str) -> list[str]:
 def short_flights(*, has_figures: bool = False) -> Iterator[None]:
     """One large step of each axis and a third of the hold: enough to identify, in a quarter of the time.
 
-    Every second dead time is tried; test_identify.py tries them all. Pages leave their figures out unless asked for.
+    Every second dead time is tried; test_identify.py tries them all. Pages leave their figures out unless asked for,
+    and flights draw none, as nobody reads it.
     """
     with pytest.MonkeyPatch.context() as patch, nullcontext() if has_figures else omit_figures():
+        patch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
         patch.setattr(fit, "COARSE_S", fit.COARSE_S[::2])
         patch.setattr(excitation, "STEP_SIZES", excitation.STEP_SIZES[-1:])
         patch.setattr(excitation, "HOLD_S", 7.5)
