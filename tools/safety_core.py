@@ -40,6 +40,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "uavctl/flight/monitors/observation.py": ENVELOPE,
     "uavctl/flight/monitors/observer.py": ENVELOPE,
     "uavctl/flight/monitors/outside.py": ("tests/flight/test_envelope.py", "tests/flight/test_response.py"),
+    "uavctl/flight/monitors/smoothing.py": ("tests/flight/test_smoothing.py", "tests/flight/test_smoothing_rules.py"),
     "uavctl/flight/monitors/vehicle_velocity.py": ENVELOPE,
     "uavctl/flight/monitors/response.py": ("tests/flight/test_response.py",),
     "uavctl/flight/monitors/velocity.py": ENVELOPE,

@@ -172,7 +172,8 @@ def test_a_velocity_that_is_none_is_not_noted() -> None:
     nothing = VehicleMotion(velocity_mps=None, velocity_ns=None, attitude_rad=None, attitude_ns=None)
     bad = replace(nothing, velocity_mps=(0.0, math.nan, 0.0), velocity_ns=at_ns + 50 * MS)
     again = replace(nothing, velocity_mps=(0.1, 0.1, 0.1), velocity_ns=at_ns)
-    assert all(smoothing.note_velocity(track, motion) is track for motion in (None, nothing, bad, again))
+    half = replace(nothing, velocity_ns=at_ns + 50 * MS), replace(again, velocity_ns=None)
+    assert all(smoothing.note_velocity(track, motion) is track for motion in (None, nothing, *half, bad, again))
 
 
 def test_a_position_that_is_no_newer_shows_nothing() -> None:

@@ -5,7 +5,7 @@
 2. Changes of offsets over half a second are compared with those of v_f, both less their means: a drift makes the same
    change at all times. Least squares give τ. Older changes are forgotten while new ones come; hovering shows nothing.
 3. The same changes are compared with those of the distance: a frame of another unit makes such. τ is believed only
-   where smoothing leaves a fifth of them at most, and half of what such a frame leaves.
+   where smoothing leaves half of what such a frame leaves, and at first a fifth of all.
 4. τ v_f is added to each position. Where the delay that counts changes, all that was estimated with the one before
    moves along: no estimate takes the change for motion.
 
@@ -37,8 +37,8 @@ KEPT_NS = 2_500_000_000  # own velocities are kept for so long: positions may co
 LEAST_CHANGE_MPS = 0.1  # of v_f: less shows nothing of a delay
 FORGET_S = 5.0  # time constant with which changes are forgotten
 LEAST_SQUARES_M2PS2 = 1.0  # Σ |Δv_f|² of a first belief: accelerations of the first two seconds make 3 to 7
-LEFT_PART, LEFT_PART_LATER = 0.2, 0.5  # of the squares that smoothing may leave, at first and while it is believed
-LEFT_BY_FRAME_PART = 0.5  # of what another frame leaves
+LEFT_PART = 0.2  # of the squares that smoothing may leave before it is believed
+LEFT_BY_FRAME_PART = 0.5  # of what another frame leaves, which is no more than all squares
 CHANGE_S = 0.03  # least change of the delay that counts: 0.05 m at 1.5 m/s
 SILENCE_NS = 1_000_000_000  # without positions; own velocities are corrected for as long after it
 _TIME = itemgetter(0)
@@ -62,7 +62,7 @@ class SmoothingTrack(msgspec.Struct, frozen=True):
 
     def compute_lag_m(self, at_ns: int) -> Vec3:
         """Compute how far a position of a time is behind [m]."""
-        if not self.late_s or not self.flown:
+        if not self.flown:
             return ZERO
         # τ v_f
         return _scale(self.late_s, _look_up(self.flown, at_ns)[1])
@@ -175,7 +175,7 @@ def _estimate_delay_s(sums: tuple[float, ...], late_s: float) -> float:
     # τ = -Σ Δo' Δv_f / Σ |Δv_f|²; it leaves Σ |Δo|² - (Σ Δo' Δv_f)² / Σ |Δv_f|², and so does a frame with Δs
     delay_s = -off_speed / speed_2
     left, left_by_frame = off_2 - off_speed**2 / speed_2, off_2 - off_way**2 / way_2
-    is_right = left <= (LEFT_PART_LATER if late_s else LEFT_PART) * off_2 and left <= LEFT_BY_FRAME_PART * left_by_frame
+    is_right = (late_s or left <= LEFT_PART * off_2) and left <= LEFT_BY_FRAME_PART * left_by_frame
     return delay_s if is_right and LEAST_S <= delay_s <= LARGEST_S else 0.0
 
 
