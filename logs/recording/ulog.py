@@ -6,6 +6,7 @@ All times of such a file are those of the vehicle's own clock, since its start; 
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import math
 import struct
@@ -63,6 +64,19 @@ def is_ulog(path: Path) -> bool:
     return detect_kind(path) is FileKind.ULOG
 
 
+@contextlib.contextmanager
+def _pause_garbage_collection() -> Iterator[None]:
+    """Pause the garbage collector, which looks at all topics so far again and again while pyulog makes more."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+@_pause_garbage_collection()
 def read_ulog(path: Path) -> MavlinkFlight:
     """Read the flight in a ULog.
 

@@ -20,6 +20,7 @@ from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.config.document import find_excess, find_key_lines, read_text
 from uavctl.config.mission import MissionConfig, TrajectoryConfig, read_trajectory_file
+from uavctl.errors import RecordingError
 
 FRAME = rows_of(TLOGS[0])[0][3]
 BEGIN_US = 1_700_000_000_000_000
@@ -143,6 +144,22 @@ def test_the_garbage_collector_looks_at_no_field_of_a_definition() -> None:
     few = files.MAVLINK_FIELDS
     many = few + "".join(f"uint8[4] field{number}\n" for number in range(200))
     assert count_tracked(many) == count_tracked(few) <= 1
+
+
+def count_collections() -> int:
+    return sum(one["collections"] for one in gc.get_stats())
+
+
+def test_the_garbage_collector_does_not_go_through_topics_while_more_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "flight.ulg"
+    make_subscriptions(path, 3000)
+    before = count_collections()
+    read_ulog(path)
+    assert count_collections() - before <= 2  # one right before, one right after
+    path.write_bytes(b"ULog")
+    with pytest.raises(RecordingError):
+        read_ulog(path)
+    assert gc.isenabled()
 
 
 def test_a_definition_that_is_repeated_is_parsed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
