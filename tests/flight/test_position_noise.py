@@ -256,10 +256,16 @@ def test_no_positions_shift_by_more_than_so_much_and_no_three_are_refused_alike(
 
 
 def judge(
-    north_m: float, *, std_m: Vec3 = NONE, at_ns: int = 1, age_s: float = 0.0, **known: Any
+    north_m: float,
+    *,
+    std_m: Vec3 = NONE,
+    at_ns: int = 1,
+    age_s: float = 0.0,
+    beside_own_m: Vec3 | None = None,
+    **known: Any,
 ) -> tuple[JumpTrack, Outcome]:
     """Take a position so far north of its prediction."""
-    return jumps.update(JumpTrack(**known), (north_m, 0.0, 0.0), np.array(std_m), at_ns, age_s)
+    return jumps.update(JumpTrack(**known), (north_m, 0.0, 0.0), np.array(std_m), at_ns, age_s, beside_own_m)
 
 
 @pytest.mark.parametrize(
@@ -275,6 +281,30 @@ def test_a_position_beyond_each_bound_is_a_jump(std_m: Vec3, age_s: float, bound
     for sign in (1.0, -1.0):
         assert judge(sign * bound_m, std_m=std_m, age_s=age_s)[1] is Outcome.COUNTS
         assert judge(sign * just_more(bound_m), std_m=std_m, age_s=age_s)[1] is Outcome.REFUSED
+
+
+@pytest.mark.parametrize(
+    ("beside_own_m", "outcome"),
+    [
+        (None, Outcome.REFUSED),
+        (NONE, Outcome.COUNTS),
+        ((0.0, 0.0, 0.125 - 2.0**-10), Outcome.COUNTS),
+        ((0.0, -0.125, 0.0), Outcome.REFUSED),
+        ((0.25, 0.0, 0.0), Outcome.REFUSED),
+    ],
+)
+def test_a_position_that_moved_as_its_own_velocity_says_did_not_jump(
+    beside_own_m: Vec3 | None, outcome: Outcome
+) -> None:
+    """The midpoint: a jump leaves all of the offset beside the own velocity, a wrong prediction nothing."""
+    assert judge(0.25, beside_own_m=beside_own_m)[1] is outcome
+
+
+def test_a_jump_that_waits_is_not_confirmed_by_a_position_that_moved_as_its_own_velocity_says() -> None:
+    jump: Vec3 = (0.25, 0.0, 0.0)
+    for beside_own_m, shift_m in ((None, jump), (jump, jump), (NONE, NONE)):
+        track, outcome = judge(0.25, beside_own_m=beside_own_m, jump_m=jump)
+        assert (outcome, track.shift_m, track.jump_m) == (Outcome.COUNTS, shift_m, None)
 
 
 @pytest.mark.parametrize(

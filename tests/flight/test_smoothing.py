@@ -14,6 +14,7 @@ from uavctl.arrays import SECOND_NS, Array
 from uavctl.flight.estimator import FilterHistory, begin_history, insert_sample, predict_belief, shift_positions
 from uavctl.flight.kalman import make_kalman
 from uavctl.flight.monitors import smoothing
+from uavctl.flight.monitors.observation import MOTION_NS
 from uavctl.flight.monitors.smoothing import SmoothingTrack
 from uavctl.records import Vec3, VehicleMotion
 
@@ -95,6 +96,31 @@ def test_nothing_is_added_to_positions_that_are_no_smoothed_ones(name: str) -> N
 
 
 @pytest.mark.fault(100)
+@pytest.mark.parametrize("name", LAGS)
+def test_the_offset_of_positions_stays_while_they_are_right_on_the_whole(name: str) -> None:
+    """Positions that are 0.2 m aside have another offset by 0.2 m."""
+    track, _ = fly(lambda at_s: follow(at_s, LAGS[name]), 10.0)
+    newest_ns, aside = track.flown[-1][0], 0.2 * NORTH
+    offsets = []
+    for at_s in np.arange(8.0, 9.9, 0.1).tolist():
+        place = follow(at_s, LAGS[name])
+        for north, east, down in (place.tolist(), (place + aside).tolist()):
+            offset = track.compute_offset_m(START_NS + round(at_s * 1e9), (north, east, down))
+            assert offset is not None
+            offsets.append(offset)
+    right, other = np.array(offsets[::2]), np.array(offsets[1::2])
+    assert np.abs(right - right.mean(axis=0)).max() < 0.05
+    assert np.abs(other - right - aside).max() < 1e-9
+    for at_ns, is_known in (
+        (track.flown[0][0], True),
+        (track.flown[0][0] - 1, False),
+        (newest_ns + MOTION_NS, True),
+        (newest_ns + MOTION_NS + 1, False),
+    ):
+        assert (track.compute_offset_m(at_ns, (0.0, 0.0, 0.0)) is not None) == is_known
+    assert SmoothingTrack().compute_offset_m(0, (0.0, 0.0, 0.0)) is None
+
+
 def test_noise_of_5_cm_is_no_smoothing() -> None:
     _, added = fly(follow, 12.0, noise_m=0.05)
     assert all(lag_m == (0.0, 0.0, 0.0) for _, lag_m in added)

@@ -333,7 +333,7 @@ def _judge_sample(
             )
         if not sources.noise.is_known:
             return sources, NO_VERDICT
-        return _judge_jump(kalman, sources, offset, corrected, belief)
+        return _judge_jump(kalman, sources, offset, sample, corrected, belief)
     if frozen.is_repeat(tracks[sample.source], at_ns):
         # A repeated value did not jump: the prediction has moved away from a source that is frozen.
         return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_FROZEN)
@@ -365,7 +365,12 @@ def _correct_sample(sources: SourceHealth, sample: PositionSample, at_ns: int) -
 
 
 def _judge_jump(
-    kalman: Kalman, sources: SourceHealth, offset: Array, corrected: PositionSample, belief: Belief
+    kalman: Kalman,
+    sources: SourceHealth,
+    offset: Array,
+    sample: PositionSample,
+    corrected: PositionSample,
+    belief: Belief,
 ) -> tuple[SourceHealth, Verdict]:
     """Judge whether a sample inside the gate belongs to another solution of the camera system."""
     at_ns, n_axes = read_capture_ns(corrected), len(kalman.axes)
@@ -376,13 +381,27 @@ def _judge_jump(
     offset_std_m = np.sqrt(belief.cov.diagonal()[index] + compute_position_variance(kalman.parameters, corrected))
     north, east, down = offset_m
     age_s = (at_ns - belief.captured_ns) * 1e-9
-    track, outcome = jumps.update(sources.jumps, (north, east, down), offset_std_m, at_ns, age_s)
-    sources = replace(sources, jumps=track)
+    beside_own_m = _compute_beside_own(sources, at_ns, sample.position_m)
+    track, outcome = jumps.update(sources.jumps, (north, east, down), offset_std_m, at_ns, age_s, beside_own_m)
     if outcome is jumps.Outcome.COUNTS:
-        return sources, NO_VERDICT
+        return replace(sources, jumps=replace(track, counted=(at_ns, sample.position_m))), NO_VERDICT
+    sources = replace(sources, jumps=track)
     if outcome is jumps.Outcome.TOO_FAR:
         sources = replace(sources, outliers=OutlierTrack(at_ns, at_ns, 1, offset[:n_axes]))
     return sources, Verdict(Action.DISTRUST_POSITIONS, EventCode.SAMPLE_JUMP)
+
+
+def _compute_beside_own(sources: SourceHealth, at_ns: int, position_m: Vec3) -> Vec3 | None:
+    """Compute the way of a position since the last one that counted, less that of the vehicle's own velocity [m]."""
+    if sources.jumps.counted is None:
+        return None
+    before = sources.smoothing.compute_offset_m(*sources.jumps.counted)
+    now = sources.smoothing.compute_offset_m(at_ns, position_m)
+    if before is None or now is None:
+        return None
+    # Δp - Δs = o - o_0
+    north, east, down = (o - o_0 for o, o_0 in zip(now, before, strict=True))
+    return north, east, down
 
 
 def _is_flying(vehicle: VehicleStatus | None) -> bool:

@@ -5,7 +5,9 @@
 2. If the next one is as far away, in the same direction, the camera system has another solution. From then on
    positions count less this shift, so no estimate takes the jump for a velocity. Right after a silence none counts
    as a jump.
-3. The shift fades by `FADE_MPS`. So the estimate comes to the new solution slowly, and lies between both while they
+3. A position whose way since the last one that counted is that of the vehicle's own velocity did not jump, however far
+   away it is: the prediction is wrong, as with a vehicle whose response is quicker than the model's.
+4. The shift fades by `FADE_MPS`. So the estimate comes to the new solution slowly, and lies between both while they
    alternate. All jumps together shift positions by no more than `MAX_SHIFT_M`.
 
 While others fly the vehicle nothing is a jump: its own climb and landing must end at once where positions are wrong.
@@ -35,6 +37,8 @@ LOST_S = 1.5  # where none has counted for so long, the estimate may be wrong: a
 GROWN_PART = 0.75
 # The next position is as far away, by this part: a wrong acceleration makes four times as much in twice the time.
 SAME_PART = 0.4
+# Largest part of an offset that own velocity and position may differ by: a jump makes all of it, a prediction none.
+OWN_PART = 0.5
 MAX_SHIFT_M = 0.4  # two solutions are 0.1 to 0.3 m apart
 FADE_MPS = 0.05  # a fifth of the difference of velocities that ends a flight
 
@@ -55,6 +59,7 @@ class JumpTrack(msgspec.Struct, frozen=True):
     offset_m: Vec3 = ZERO  # offset of the last position that counted: a push makes offsets that grow slowly
     jump_m: Vec3 | None = None  # jump of the last position beside the shift; None for none
     seen_ns: int = 0  # capture time of the last position, believed or not
+    counted: tuple[int, Vec3] | None = None  # capture time and position, as it came, of the last one that counted
     settled_ns: int = 0  # from then on jumps are judged: not right after a silence
 
     def compute_shift_m(self, at_ns: int) -> Vec3:
@@ -80,16 +85,21 @@ def suspend(track: JumpTrack, at_ns: int) -> JumpTrack:
     return JumpTrack(seen_ns=track.seen_ns, settled_ns=max(track.settled_ns, at_ns + 1))
 
 
-def update(track: JumpTrack, offset_m: Vec3, std_m: Array, at_ns: int, age_s: float) -> tuple[JumpTrack, Outcome]:
+def update(
+    track: JumpTrack, offset_m: Vec3, std_m: Array, at_ns: int, age_s: float, beside_own_m: Vec3 | None = None
+) -> tuple[JumpTrack, Outcome]:
     """Take a position inside the gate, which was noted; return its outcome, too.
 
     Args:
         offset_m: Position less the shift and the prediction.
         std_m: Standard deviation of that offset, each axis of the plant.
         age_s: Time since the newest position that counted.
+        beside_own_m: Its way since the last one that counted, less that of the own velocity; None where it is unknown.
     """
     jump_m = track.jump_m
-    if at_ns < track.settled_ns or age_s > LOST_S:
+    # |Δp - Δs| < c |ν|
+    is_flown = beside_own_m is not None and math.hypot(*beside_own_m) < OWN_PART * math.hypot(*offset_m)
+    if at_ns < track.settled_ns or age_s > LOST_S or is_flown:
         return replace(track, offset_m=offset_m, jump_m=None), Outcome.COUNTS
     if jump_m is not None and math.dist(offset_m, jump_m) <= SAME_PART * math.hypot(*offset_m):
         return _confirm_jump(track, offset_m, jump_m, at_ns)

@@ -67,6 +67,14 @@ class SmoothingTrack(msgspec.Struct, frozen=True):
         # τ v_f
         return _scale(self.late_s, _look_up(self.flown, at_ns)[1])
 
+    def compute_offset_m(self, at_ns: int, position_m: Vec3) -> Vec3 | None:
+        """Compute the offset of a position, its delay counted in [m]; None where the own velocity is not known."""
+        if not _is_known(self.flown, at_ns):
+            return None
+        # o = p + τ v_f - s
+        _, filtered, distance = _look_up(self.flown, at_ns)
+        return _combine(_combine(position_m, 1.0, filtered, self.late_s), 1.0, distance, -1.0)
+
 
 class DelayChange(msgspec.Struct, frozen=True):
     """Change of the delay that counts."""
@@ -136,8 +144,7 @@ def update(track: SmoothingTrack, at_ns: int, position_m: Vec3) -> SmoothingTrac
         return track
     gap_ns = at_ns - track.seen_ns
     track = replace(track, seen_ns=at_ns, resumed_ns=at_ns if gap_ns > SILENCE_NS else track.resumed_ns)
-    is_known = bool(track.flown) and track.flown[0][0] <= at_ns <= track.flown[-1][0] + MOTION_NS
-    if not is_known or at_ns - track.resumed_ns < SILENCE_NS:
+    if not _is_known(track.flown, at_ns) or at_ns - track.resumed_ns < SILENCE_NS:
         return replace(track, changes=())
     _, filtered, distance = _look_up(track.flown, at_ns)
     now = at_ns, _combine(position_m, 1.0, distance, -1.0), filtered, distance
@@ -177,6 +184,11 @@ def _estimate_delay_s(sums: tuple[float, ...], late_s: float) -> float:
     left, left_by_frame = off_2 - off_speed**2 / speed_2, off_2 - off_way**2 / way_2
     is_right = (late_s or left <= LEFT_PART * off_2) and left <= LEFT_BY_FRAME_PART * left_by_frame
     return delay_s if is_right and LEAST_S <= delay_s <= LARGEST_S else 0.0
+
+
+def _is_known(flown: tuple[_Flown, ...], at_ns: int) -> bool:
+    """Whether the own velocity is known at a time."""
+    return bool(flown) and flown[0][0] <= at_ns <= flown[-1][0] + MOTION_NS
 
 
 def _look_up(flown: tuple[_Flown, ...], at_ns: int) -> tuple[Vec3, Vec3, Vec3]:
