@@ -13,6 +13,7 @@ from msgspec import structs
 from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import LATEST_STAMP_NS, begin_history, note_input, predict_belief
 from uavctl.flight.measure import GatedSamples, gate_samples
+from uavctl.flight.monitors import smoothing
 from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.flight.state import SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleMotion
@@ -239,3 +240,26 @@ def test_the_first_value_of_all_is_watched_and_stays_where_nothing_else_is_known
     assert refused_as(found[18])
     assert found[18].history.captured_ns == START_NS
     assert found[18].dropped_after_ns is None
+
+
+@pytest.mark.parametrize(("own_mps", "jumps"), [(4.0, False), (0.0, True), (-4.0, True), (None, True)])
+def test_a_position_far_from_its_prediction_jumped_unless_the_own_velocity_shows_its_way(
+    own_mps: float | None, jumps: bool
+) -> None:
+    """After two seconds at rest one position is lost, and the next is 0.3 m further north."""
+    history, sources, last = begin_history(CONTROLLER.kalman, START_NS, START_NS), SourceHealth(), 42
+    intake = GatedSamples(history, sources)
+    for tick in range(last + 1):
+        at_ns = START_NS + tick * TICK_NS
+        if own_mps is not None:
+            # Ticks of 0.05 s: its way is 4 m/s (½ + 1) 0.05 s = 0.3 m.
+            velocity: Vec3 = (own_mps if tick >= last - 1 else 0.0, 0.0, 0.0)
+            motion = VehicleMotion(velocity_mps=velocity, velocity_ns=at_ns)
+            sources = structs.replace(sources, smoothing=smoothing.note_velocity(sources.smoothing, motion))
+        place: Vec3 = (0.3 if tick == last else 0.001 * (tick % 2), 0.0, 0.0)
+        said = () if tick == last - 1 else (sample(at_ns, position_m=place),)
+        inp = StepInput(tick=tick, at_ns=at_ns, samples=said, vehicle=vehicle())
+        intake = gate_samples(CONTROLLER.kalman, CONTROLLER.reach, history, sources, inp, HORIZON, 0)
+        assert tick == last or not intake.refused
+        history, sources = intake.history, intake.sources
+    assert refused_as(intake) == ({EventCode.SAMPLE_JUMP} if jumps else set())
