@@ -124,6 +124,11 @@ def test_a_setpoint_beyond_the_tilt_keeps_its_direction() -> None:
     assert sent[1] / sent[0] == pytest.approx(3.9 / 3.0)
 
 
+def test_a_setpoint_of_the_largest_tilt_passes_unchanged() -> None:
+    largest = (9.81 * math.tan(math.radians(20.0)), 0.0, 0.0)
+    assert limit_setpoint(largest, largest, TICK_S, TILTED) == (largest, ())
+
+
 def test_all_corners_of_the_box_are_within_the_tilt() -> None:
     north, east, down = TILTED.box_mps2
     for corner in ((north, east, down), (-north, east, -down), (north, -east, down)):
