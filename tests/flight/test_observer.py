@@ -376,4 +376,6 @@ def test_positions_that_move_leave_the_observer_as_if_they_had_come_so(has_inert
     late, at_once = fly(20).motion.observer, fly(0).motion.observer
     assert late is not None and at_once is not None
     assert late.mean == pytest.approx(at_once.mean, abs=1e-12)
+    assert (late.inertial is not None) == has_inertial
+    assert late.inertial == pytest.approx(at_once.inertial, abs=1e-12)
     assert shift_monitors(INITIAL, change, START_NS).motion.observer is None
