@@ -171,6 +171,14 @@ def test_between_two_near_limits_there_is_no_retreat() -> None:
     assert find_retreat((0.0, 0.0, 0.0), (-0.4, -0.4, -math.inf), (0.4, 0.6, 0.4)) == (0.0, RETREAT_MPS, -RETREAT_MPS)
 
 
+def test_a_retreat_from_a_limit_is_no_drift_once_it_is_over() -> None:
+    """Half a metre from the limit the velocity of the retreat is left, in HOLD."""
+    hold = Fallback(mode=HOLD, since_ns=0)
+    for axes in ((RETREAT_MPS, 0.0), (RETREAT_MPS, RETREAT_MPS)):
+        after = advance_fallback(hold, S, math.hypot(*axes), ZERO, PARAMETERS, is_measured=True)
+        assert (after.mode is HOLD) == (axes[1] == 0.0)
+
+
 def test_holding_accelerates_no_vehicle_to_a_limit_that_it_retreats_from() -> None:
     accel_mps2 = (0.3, -0.2, 0.1)
     assert keep_from_limits(accel_mps2, ZERO) == accel_mps2
