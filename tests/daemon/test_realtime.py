@@ -19,6 +19,7 @@ SECOND = 1_000_000_000
 
 @pytest.fixture(autouse=True)
 def _as_before() -> Iterator[None]:
+    gc.unfreeze()  # another test of this process may have left objects frozen
     before = os.sched_getscheduler(0)
     yield
     assert os.sched_getscheduler(0) == before
