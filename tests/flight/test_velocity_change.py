@@ -170,10 +170,10 @@ def test_the_velocity_before_the_lie_is_kept_with_what_setpoints_change_since(
 
 
 def test_no_velocity_is_kept_while_the_own_one_is_right() -> None:
-    wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO)
+    wrong = VelocityChangeState(velocity_wrong_ns=START_NS, right_beside_model_mps=ZERO, right_ns=START_NS)
     positions = VelocityState(offsets=((START_NS + 1, ZERO),), apart_mps=0.0)
     (state,) = fly(1, true, true, state=wrong, velocity=positions)
-    assert state.right_beside_model_mps is None
+    assert (state.right_beside_model_mps, state.right_ns) == (None, None)
     assert {one.right_beside_model_mps for one in fly(40, true, true)} == {None}
 
 
@@ -195,7 +195,7 @@ def test_positions_that_agree_make_no_velocity_right_that_repeats(shown: str) ->
 
 def test_a_velocity_repeats_once_it_has_for_longer_than_any_message_takes() -> None:
     state = VelocityChangeState(repeated=(ZERO, ZERO, START_NS))
-    assert [state.repeats(START_NS + REPEATS_NS + after_ns) for after_ns in (0, 1)] == [False, True]
+    assert [state.repeats(START_NS + 1_000_000_000 + after_ns) for after_ns in (0, 1)] == [False, True]
     assert not VelocityChangeState().repeats(START_NS)
 
 
@@ -368,9 +368,9 @@ def test_beside_wrong_inertial_data_gusts_bound_the_own_velocity() -> None:
 def test_the_velocity_at_the_begin_of_the_window_is_kept_where_the_own_one_is_wrong(wrong_ns: int | None) -> None:
     first, model = (north(1.0), ZERO, north(0.25)), north(0.25)
     wrong = compare(north(3.0), ZERO, first=first, model=model, inertial_wrong_ns=wrong_ns)
-    assert wrong.right_beside_model_mps == north(0.75)
+    assert (wrong.right_beside_model_mps, wrong.right_ns) == (north(0.75), START_NS)
     right = compare(north(1.0), north(-2.0), first=first, model=model, inertial_wrong_ns=wrong_ns)
-    assert (is_found(right), right.right_beside_model_mps) == ((False, True), None)
+    assert (is_found(right), right.right_beside_model_mps, right.right_ns) == ((False, True), None, None)
 
 
 @pytest.mark.parametrize(
@@ -388,6 +388,12 @@ def test_setpoints_support_the_velocity_within_gusts_from_half_a_second_on(
     assert wrong.disagrees_ns == (START_NS if is_found(wrong) == (True, True) else None)
     both = compare(north(own_mps), north(9.0), ns=ns, inertial_wrong_ns=START_NS, velocity_wrong_ns=START_NS)
     assert (both.agreed_ns, both.velocity_wrong_ns) == (None, START_NS)
+
+
+def test_changes_are_compared_whatever_the_velocities_were_at_first() -> None:
+    at_first = (north(1.0), north(2.0), north(4.0))
+    state = compare(north(1.5), north(2.5), first=at_first, model=north(4.5))
+    assert (state.agreed_ns, is_found(state)) == (START_NS + HALF_S_NS, (False, False))
 
 
 def test_samples_of_the_last_second_are_compared_each_once() -> None:
@@ -423,6 +429,7 @@ def test_a_velocity_may_repeat_and_leap_up_to_a_bound(own_mps: float, model_mps:
     tick = seen(at_ns, vehicle_motion=motion(north(own_mps), at_ns))
     state = update(before, TickObservation(tick, Motion(model_mps=north(model_mps)), PARAMETERS), NO_POSITIONS)
     assert is_found(state) == (is_wrong, False)
+    assert state.right_ns == (START_NS if is_wrong else None)
 
 
 def test_times_and_bounds_count_to_the_last_nanosecond_and_bit() -> None:
