@@ -432,6 +432,16 @@ def test_a_velocity_may_repeat_and_leap_up_to_a_bound(own_mps: float, model_mps:
     assert state.right_ns == (START_NS if is_wrong else None)
 
 
+@pytest.mark.parametrize("repeats", [True, False])
+def test_one_message_does_not_repeat_itself(repeats: bool) -> None:
+    """Setpoints have changed the velocity since the message by far more than the bound."""
+    at_ns = START_NS + 100 * MS
+    before = VelocityChangeState(repeated=(ZERO, ZERO, START_NS))
+    tick = seen(at_ns, vehicle_motion=motion(ZERO, at_ns if repeats else START_NS))
+    state = update(before, TickObservation(tick, Motion(model_mps=north(1.0)), PARAMETERS), NO_POSITIONS)
+    assert is_found(state) == (repeats, False)
+
+
 def test_times_and_bounds_count_to_the_last_nanosecond_and_bit() -> None:
     agreed = VelocityChangeState(agreed_ns=START_NS)
     assert agreed.supports_velocity(START_NS + 300 * MS) and not agreed.supports_velocity(START_NS + 300 * MS + 1)

@@ -177,7 +177,8 @@ def _judge_alone(
     (own, model, own_ns), (before, model_before, before_ns) = shown, state.repeated
     # It repeats: |Δm| > v_max; it leaps: |Δv - Δm| > v_max + max(6 m/s² Δt, 2 |Δm|), or v_max + 3 m/s² Δt
     if own == before:
-        is_wrong = math.dist(model, model_before) > parameters.disagreement_mps
+        # One message does not repeat itself: PX4 sends ten a second on some links, and brakes by 0.3 m/s in between.
+        is_wrong = own_ns > before_ns and math.dist(model, model_before) > parameters.disagreement_mps
     else:
         off_mps = math.dist(_subtract(own, before), _subtract(model, model_before))
         s = (own_ns - before_ns) * 1e-9
