@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Self
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -170,16 +170,25 @@ def read_design(header: Header) -> DesignView:
         view = msgspec.convert(header.design, DesignView)
     except msgspec.ValidationError as error:
         raise RecordingError(f"the header's design cannot be used: {error}") from error
-    free = _get_free_input(header.config_toml)
+    free = _get_free_input(header)
     sides = tuple(b + free * sum(map(abs, row)) for row, b in zip(view.c_u, view.b_u, strict=True))
     return msgspec.structs.replace(view, b_u=sides)
 
 
-@lru_cache(4)  # a flight is read several times: for its figures, page and tables
-def _get_free_input(config_toml: str) -> float:
+@lru_cache(4)  # the figures, page and tables of a flight ask for it a dozen times
+def parse_recorded_config(config_toml: str) -> Mapping[str, Any]:
+    """Parse the configuration in a header; not to be changed.
+
+    Raises:
+        ConfigError: If it cannot be read any more.
+    """
+    return parse_stored_toml(config_toml, "configuration")
+
+
+def _get_free_input(header: Header) -> float:
     """Return how much of each input plans leave free to act against a bias [input units]."""
     try:
-        estimator = parse_stored_toml(config_toml, "configuration").get("estimator", {})
+        estimator = parse_recorded_config(header.config_toml).get("estimator", {})
     except ConfigError:
         return 0.0  # the page shows the damaged text, and limits that are cautious
     return float(estimator.get("bias_max", 0.0))
@@ -188,7 +197,7 @@ def _get_free_input(config_toml: str) -> float:
 def get_config_name(header: Header) -> str | None:
     """Return the name in a recording's configuration; None if there is none, or the TOML is damaged."""
     try:
-        name = parse_stored_toml(header.config_toml, "configuration").get("name")
+        name = parse_recorded_config(header.config_toml).get("name")
     except ConfigError:
         return None
     return name if isinstance(name, str) else None

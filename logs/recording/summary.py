@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,12 +14,11 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.design_view import Box
+from logs.recording.design_view import Box, parse_recorded_config
 from logs.recording.flight import FLOWN, FlightData
 from uavctl.account import make_ending, report_lost_records
 from uavctl.arrays import Array, Flags
 from uavctl.cause import CAUSES, Cause
-from uavctl.config.load import parse_stored_toml
 from uavctl.config.mission import FenceConfig
 from uavctl.errors import ConfigError
 from uavctl.number_text import format_duration, format_number, format_percent_above
@@ -90,7 +88,7 @@ def compute_limits(flight: FlightData, t_s: Array) -> Array:
     """Return the right sides of the state set's rows (n, m_x) at report times (n,) [s]."""
     design, begun_s = flight.design, flight.targets[0][0]
     limits = np.tile(np.array(design.b_x), (len(t_s), 1))
-    for fence in _read_fences(flight.header.config_toml):
+    for fence in _read_fences(flight):
         state, box = fence.state, design.state_box
         if isinstance(state, str):
             state = design.position_index[design.axes.index(state)]
@@ -114,11 +112,10 @@ def compute_box(flight: FlightData, t_s: Array) -> tuple[Array, Array]:
     return sides[0], sides[1]
 
 
-@lru_cache(4)  # a page asks for the limits a dozen times
-def _read_fences(config_toml: str) -> tuple[FenceConfig, ...]:
-    """Return the fences of a flight's configuration; none if it cannot be read any more."""
+def _read_fences(flight: FlightData) -> tuple[FenceConfig, ...]:
+    """Return the fences of the flight's configuration; none if it cannot be read any more."""
     try:
-        fences = parse_stored_toml(config_toml, "configuration").get("fence", [])
+        fences = parse_recorded_config(flight.header.config_toml).get("fence", [])
         return msgspec.convert(fences, tuple[FenceConfig, ...])
     except (ConfigError, msgspec.ValidationError):
         return ()

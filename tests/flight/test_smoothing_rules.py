@@ -92,7 +92,7 @@ def test_between_two_velocities_all_is_on_the_line_between_them() -> None:
     assert early.compute_lag_m(START_NS - SECOND_NS) == early.compute_lag_m(START_NS) == (0.0, 1.0, 0.0)
 
 
-def test_a_silence_of_the_own_velocity_begins_anew() -> None:
+def test_a_silence_of_the_own_velocity_begins_its_record_again() -> None:
     """Distances across a longer silence than its velocity counts for are not known."""
     track = smoothing.note_velocity(SmoothingTrack(), moving(START_NS, (1.0, 0.0, 0.0)))
     track = replace(track, changes=((START_NS, ZEROS, ZEROS, ZEROS),))
@@ -100,8 +100,8 @@ def test_a_silence_of_the_own_velocity_begins_anew() -> None:
     on = smoothing.note_velocity(track, moving(START_NS + silence_ns, (1.0, 0.0, 0.0)))
     assert len(on.flown) == 2 and on.changes == track.changes
     for at_ns in (START_NS + silence_ns + 1, START_NS - 1):
-        anew = smoothing.note_velocity(track, moving(at_ns, (2.0, 0.0, 0.0)))
-        assert anew.flown == ((at_ns, (2.0, 0.0, 0.0), (2.0, 0.0, 0.0), ZEROS),) and anew.changes == ()
+        again = smoothing.note_velocity(track, moving(at_ns, (2.0, 0.0, 0.0)))
+        assert again.flown == ((at_ns, (2.0, 0.0, 0.0), (2.0, 0.0, 0.0), ZEROS),) and again.changes == ()
 
 
 def test_velocities_are_kept_for_as_long_as_positions_may_come_late() -> None:

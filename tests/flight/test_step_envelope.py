@@ -214,17 +214,22 @@ def test_inertial_data_that_are_no_numbers_are_nothing_that_the_vehicle_feels() 
     assert climbing((float("nan"), 0.0, 0.0)) == climbing(None)
 
 
+def fly_into_silence(steps: int) -> tuple[Controller, ControlState, list[StepInput]]:
+    """Fly five steps with positions, then H + 1 without; return the state, and the inputs of so many further steps."""
+    ours, last = controller(), 5 + make_controller().horizon + 1
+    inputs = make_inputs(range((last + steps) * TICKS), make_step_samples(range(5, last + 1), steps=last + steps))
+    state = make_initial_state()
+    for inp in inputs[: last * TICKS]:
+        state, _ = run_tick(state, inp, ours)
+    return ours, state, inputs[last * TICKS :]
+
+
 @pytest.mark.fault(94)
 @pytest.mark.parametrize("is_wrong", [True, False])
 @pytest.mark.parametrize("is_silent", [True, False])
 def test_a_velocity_found_wrong_in_a_silence_ends_the_flight_on_plans(is_wrong: bool, is_silent: bool) -> None:
-    ours, last = controller(), 5 + make_controller().horizon + 1
-    samples = make_step_samples(range(5, last + 1), steps=last + 1)
-    state, inputs = make_initial_state(), make_inputs(range((last + 1) * TICKS), samples)
-    for inp in inputs[: last * TICKS]:
-        state, _ = run_tick(state, inp, ours)
+    ours, state, (inp, *_) = fly_into_silence(1)
     assert state.mode is ControlMode.BRAKE
-    inp = inputs[last * TICKS]
     fresh = (sample(inp.at_ns - 10 * MS, inp.at_ns),)
     found = VelocityChangeState(velocity_wrong_ns=inp.at_ns if is_wrong else None)
     engaged = replace(state.monitors.engaged, velocity_change=found)
@@ -262,12 +267,8 @@ def test_a_velocity_that_was_found_wrong_and_repeats_ends_the_flight_beside_posi
 @pytest.mark.fault(94)
 @pytest.mark.parametrize("right_mps", [2.0, -2.0])
 def test_a_silence_is_braked_on_the_last_own_velocity_that_was_right(right_mps: float) -> None:
-    ours, last = controller(), 5 + make_controller().horizon + 1
-    inputs = make_inputs(range((last + 5) * TICKS), make_step_samples(range(5, last + 1), steps=last + 5))
-    state = make_initial_state()
-    for inp in inputs[: last * TICKS]:
-        state, _ = run_tick(state, inp, ours)
-    for inp in inputs[last * TICKS :]:
+    ours, state, inputs = fly_into_silence(5)
+    for inp in inputs:
         found = VelocityChangeState(velocity_wrong_ns=inp.at_ns, right_beside_model_mps=(right_mps, 0.0, 0.0))
         engaged = replace(state.monitors.engaged, velocity_change=found)
         state = replace(state, monitors=replace(state.monitors, engaged=engaged))
@@ -281,12 +282,8 @@ def test_a_silence_is_braked_on_the_last_own_velocity_that_was_right(right_mps: 
 @pytest.mark.parametrize("wind_mps2", [0.4, -0.4])
 def test_the_wind_since_the_own_velocity_was_right_counts(wind_mps2: float) -> None:
     """The vehicle was at rest two seconds ago, and what is sent since then is the braking of this test alone."""
-    ours, last = controller(), 5 + make_controller().horizon + 1
-    inputs = make_inputs(range((last + 1) * TICKS), make_step_samples(range(5, last + 1), steps=last + 1))
-    state = make_initial_state()
-    for inp in inputs[: last * TICKS]:
-        state, _ = run_tick(state, inp, ours)
-    at_ns = inputs[last * TICKS].at_ns
+    ours, state, inputs = fly_into_silence(1)
+    at_ns = inputs[0].at_ns
     right_mps = tuple(-v for v in state.monitors.engaged.motion.model_mps)
     change = VelocityChangeState(
         velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps, right_ns=at_ns - 2_000_000_000
@@ -295,7 +292,7 @@ def test_the_wind_since_the_own_velocity_was_right_counts(wind_mps2: float) -> N
     biases = tuple((at_ns - after_ns, (wind_mps2,)) for after_ns in (2_500_000_000, 0))
     fallback = replace(state.fallback, biases=biases, flown=Fallback(ControlMode.BRAKE, at_ns))
     state = replace(state, monitors=replace(state.monitors, engaged=engaged), fallback=fallback)
-    state, output = run_tick(state, inputs[last * TICKS], ours)
+    state, output = run_tick(state, inputs[0], ours)
     assert state.mode is ControlMode.BRAKE and output.setpoint is not None
     # a = -d - g d t
     wanted = -wind_mps2 * (1.0 + 2.0 * ours.fallback.brake_gain_1ps)

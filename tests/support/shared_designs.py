@@ -27,7 +27,7 @@ def share_designs(patch: pytest.MonkeyPatch) -> None:
     """Build each design, and its solver, once: no answer of a solver depends on earlier questions.
 
     test_shortcut.py and test_conditioned.py show that. A design depends on nothing but the problem, link and filter.
-    Tests of the builders themselves import these by name, and build anew.
+    Tests of the builders themselves import these by name, and build each time.
     """
     build_solver = controller.build_solver
     share_solver = lru_cache(KEPT)(build_solver)

@@ -45,7 +45,7 @@ def short_flights(*, has_figures: bool = False) -> Iterator[None]:
     """One large step of each axis and a third of the hold: enough to identify, in a quarter of the time.
 
     Every second dead time is tried; test_identify.py tries them all. Pages leave their figures out unless asked for,
-    and flights draw none, as nobody reads it.
+    and flights draw none, as no test reads it.
     """
     with pytest.MonkeyPatch.context() as patch, nullcontext() if has_figures else omit_figures():
         patch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)

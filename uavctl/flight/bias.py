@@ -19,7 +19,7 @@ from uavctl.smpc.plant import Plant
 # what is flown. Its acceleration would be flown for seconds without a position.
 LASTING_NS = 2_000_000_000  # a bias counts that has been estimated for so long,
 RECENT_NS = 3_000_000_000  # as far as all estimates of this time have it
-MOVES_MPS = 0.3  # below it drag is less than an estimated bias is off
+MOVES_MPS = 0.3  # a slower vehicle has less drag than an estimated bias is off by
 
 Biases = tuple[tuple[int, Vector], ...]  # (time [ns], estimated bias (n_u,)), oldest first
 

@@ -120,7 +120,7 @@ def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
     fallback = ordered.fallback
     for reason in supervised.fallback_reasons:
         fallback = request_fallback(fallback, reason, at_ns)
-    if fallback is not None and _is_velocity_wrong(phase):
+    if fallback is not None and _is_velocity_lost(phase):
         fallback = request_fallback(fallback, FallbackReason.VELOCITY_WRONG, at_ns)
     before, outliers = state.fallback.flown, state.estimator.sources.outliers
     is_final = fallback is not None and fallback.is_final
@@ -399,8 +399,8 @@ def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     )
 
 
-def _is_velocity_wrong(phase: _Phase) -> bool:
-    """Whether the vehicle's own velocity was found wrong, and no position comes, or it does nothing but repeat."""
+def _is_velocity_lost(phase: _Phase) -> bool:
+    """Whether the vehicle's own velocity was found wrong, and it repeats, or no position comes."""
     supervised, at_ns = phase.supervised, phase.context.at_ns
     change = supervised.monitors.engaged.velocity_change
     if change.velocity_wrong_ns is None:

@@ -19,9 +19,9 @@ A state machine of four modes, each with a time limit:
    By its own velocity the vehicle brakes again if it drifts while it holds; the time to hold runs on.
 2. HOLD begins only when the setpoint has come down to the acceleration of HOLD, so it never accelerates. By a
    prediction from inputs alone the vehicle brakes only until that is slow.
-3. Near to a wall or the ceiling, braking ends at a slow retreat from it, and HOLD accelerates against it in no case:
-   without positions the vehicle drifts, and how far it is from the limit is not known well. Positions that are
-   distrusted show no limit to retreat from.
+3. Near a wall or the ceiling, braking ends at a slow retreat from it, and HOLD never accelerates to it: without
+   positions the vehicle drifts, and its distance from the limit is not known well. Positions that are distrusted show
+   no limit to retreat from.
 4. Where the vehicle's own inertial data carry the estimate on, HOLD brings it back gently to the place where it began.
 5. The way back to TRACK, from BRAKE and HOLD with reason RECOVER only, is decided at Δt boundaries
    (`uavctl.flight.decide`).
@@ -43,9 +43,8 @@ OPEN_LOOP_STILL_MPS = 0.1
 DRIFT_MPS = 0.15  # above this speed, by its own velocity, a vehicle that holds drifts
 CALM_MPS2 = 0.04  # HOLD begins when the setpoint is this close to its own
 RETURN_GAIN_1PS2, RETURN_GAIN_1PS = 1.0, 1.5  # gains of distance and speed on the way back: two seconds
-# So near to a limit a vehicle brakes to a slow retreat, and holds without acceleration to the limit. Without positions
-# the estimate may be off by as much.
-NEAR_LIMIT_M, RETREAT_MPS = 0.5, 0.15
+NEAR_LIMIT_M = 0.5  # distance of a limit to retreat from: without positions an estimate may be off by as much
+RETREAT_MPS = 0.15  # no faster than a drift: HOLD follows where one axis retreats
 RETURN_MPS2 = 1.0  # largest acceleration in any axis on the way back: the estimate may be wrong
 
 
@@ -65,7 +64,7 @@ class FallbackReason(IntEnum):
     """Reason of the fallback, which decides its end. A greater one overrides a smaller one, for good."""
 
     RECOVER = auto()  # too few positions: plans fly again once they are back
-    # No position came, and the vehicle's own velocity was found wrong: positions that come back could not be checked.
+    # The vehicle's own velocity was found wrong, and it repeats, or no position came: it cannot check positions.
     VELOCITY_WRONG = auto()
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
@@ -131,7 +130,7 @@ def advance_fallback(
 
     Args:
         at_ns: Time of this tick [ns].
-        speed_mps: Speed now [m/s]; NaN counts as moving.
+        speed_mps: Speed now, beside that of a retreat [m/s]; NaN counts as moving.
         sent_mps2: The setpoint of the tick before [m/s²].
         hold_accel_mps2: Acceleration of HOLD [m/s²].
         is_measured: Whether the speed is the vehicle's own velocity, not a prediction.

@@ -182,7 +182,7 @@ def _estimate_delay_s(sums: tuple[float, ...], late_s: float) -> float:
     # τ = -Σ Δo' Δv_f / Σ |Δv_f|²; it leaves Σ |Δo|² - (Σ Δo' Δv_f)² / Σ |Δv_f|², and so does a frame with Δs
     delay_s = -off_speed / speed_2
     left, left_by_frame = off_2 - off_speed**2 / speed_2, off_2 - off_way**2 / way_2
-    is_right = (late_s or left <= LEFT_PART * off_2) and left <= LEFT_BY_FRAME_PART * left_by_frame
+    is_right = (late_s > 0.0 or left <= LEFT_PART * off_2) and left <= LEFT_BY_FRAME_PART * left_by_frame
     return delay_s if is_right and LEAST_S <= delay_s <= LARGEST_S else 0.0
 
 

@@ -11,9 +11,9 @@
 
 A wrong velocity is not braked on, and wrong inertial data do not carry the estimate on. The own velocity that was right
 before is kept: with Δm it is the best that is known without a position. Where no position comes, the vehicle brakes
-(`uavctl.flight.supervise`). Wrong inertial data are compared again after three seconds, a wrong velocity
-once positions have agreed with it. While positions that come back correct the vehicle's own velocity, nothing is
-compared.
+(`uavctl.flight.supervise`). Wrong inertial data are compared again after three seconds, a wrong velocity once positions
+have agreed with it and it does not repeat. While positions that come back correct the vehicle's own velocity, nothing
+is compared.
 
 False alarms: none in flights without a lie in blackouts and wind (tests/e2e/test_wind_truth.py).
 """
@@ -39,7 +39,7 @@ INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degre
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 LEAST_S = 0.5  # over less, setpoints alone say nothing of an own velocity
 RECENT_NS = 300_000_000  # an agreement counts for so long
-REPEATS_NS = 1_000_000_000  # a velocity that comes twice a second has changed by then, at the least
+REPEATS_NS = 1_000_000_000  # even a velocity that comes twice a second has changed in this time
 # Leap from one message to the next: a disagreement, and what a turned response makes of usual setpoints. Where
 # inertial data were found wrong, nothing else checks the own velocity. Flights without a lie, recorded ones of real
 # autopilots included, stayed 0.2 m/s below the second bound.
@@ -177,7 +177,7 @@ def _judge_alone(
     (own, model, own_ns), (before, model_before, before_ns) = shown, state.repeated
     # It repeats: |Δm| > v_max; it leaps: |Δv - Δm| > v_max + max(6 m/s² Δt, 2 |Δm|), or v_max + 3 m/s² Δt
     if own == before:
-        # One message does not repeat itself: PX4 sends ten a second on some links, and brakes by 0.3 m/s in between.
+        # A message does not repeat itself: PX4 sends ten a second on some links, and brakes by 0.3 m/s in between.
         is_wrong = own_ns > before_ns and math.dist(model, model_before) > parameters.disagreement_mps
     else:
         off_mps = math.dist(_subtract(own, before), _subtract(model, model_before))
@@ -196,7 +196,7 @@ def _judge_alone(
 def _believe_again(
     state: VelocityChangeState, at_ns: int, velocity: VelocityState, parameters: EnvelopeParameters
 ) -> VelocityChangeState:
-    """Believe inertial data again after a time, and an own velocity once positions have agreed with it."""
+    """Believe inertial data again after a time, and an own velocity that changes once positions have agreed with it."""
     velocity_ns, inertial_ns = state.velocity_wrong_ns, state.inertial_wrong_ns
     if inertial_ns is not None and at_ns - inertial_ns > INERTIAL_DISTRUST_NS:
         state = replace(state, inertial_wrong_ns=None, samples=())
