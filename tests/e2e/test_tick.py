@@ -12,7 +12,7 @@ from types import FrameType
 from typing import TypeVar
 
 import pytest
-from loopback_rig import MemorySink, make_loop
+from loopback_rig import MemorySink
 from places import ROOT
 
 from sim.simulation import World
@@ -20,6 +20,7 @@ from uavctl.config import load_config
 from uavctl.flight.tick import tick
 from uavctl.loop import ControlLoop
 from uavctl.records import LinkStats, Outgoing, Plan, Received, Send
+from uavctl.wiring.controller import build_flight_design, prepare
 
 PAGE = (ROOT / "docs" / "tick.md").read_text(encoding="utf-8")
 T = TypeVar("T")
@@ -75,8 +76,10 @@ def trace_call(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
 @pytest.fixture(scope="module")
 def watched_loop() -> WatchedLoop:
     config = load_config("room-px4")
+    prepared = prepare(config, build_flight_design(config))
+    prepared.make_levels()  # as flights in real time do: the first tick of a level would make it
     memory = MemorySink()
-    flyer = WatchedLoop(make_loop(config, memory), memory)
+    flyer = WatchedLoop(ControlLoop(config, prepared.controller, memory, lambda: 0), memory)
     World(config, flyer).run(5.0)
     return flyer
 
