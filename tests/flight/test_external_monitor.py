@@ -48,9 +48,10 @@ def test_a_controller_that_was_given_up_is_reported_once() -> None:
     assert after.fault == state.fault == first.text
 
 
-# The wall. Braking takes 1 m/s² for each 1 m/s and 2 m/s² at most; a setpoint changes by 4 m/s² in a second.
+# The wall. Three quarters of the braking gain are 1 m/s² for each 1 m/s; 2 m/s² at most; a setpoint changes by 4 m/s² in
+# a second.
 FALLBACK = FallbackParameters(
-    brake_gain_1ps=1.0, brake_s=9.0, hold_s=9.0, blind_hold_s=9.0, land=False, recover_samples=3
+    brake_gain_1ps=4.0 / 3.0, brake_s=9.0, hold_s=9.0, blind_hold_s=9.0, land=False, recover_samples=3
 )
 LIMITS = LimitsParameters(accel_mps2=(2.0, 2.0, 2.0), slew_mps3=4.0)
 BOUNDS = replace(PARAMETERS, lower_m=(-3.0,) * 3, upper_m=(3.0,) * 3, outside_m=(2.0,) * 3, lag_s=(0.25,) * 3)

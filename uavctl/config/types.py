@@ -290,7 +290,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
 class FallbackConfig(Section, frozen=True, kw_only=True):
     """Fallback when the age reaches H."""
 
-    brake_gain_1ps: Annotated[float, declare("deceleration per speed while braking", "1/s", 1e-6, 1000)] = 1.5
+    brake_gain_1ps: Annotated[float, declare("deceleration per speed while braking", "1/s", 1e-6, 1000)] = 2.0
     brake_s: Annotated[float, declare("longest time of braking on the prediction", "s", 0, MAX_DURATION_S)] = 2.0
     hold_s: Annotated[float, declare("zero acceleration after braking", "s", 0, MAX_DURATION_S)] = 3.0
     blind_hold_s: Annotated[

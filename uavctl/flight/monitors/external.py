@@ -28,6 +28,7 @@ from uavctl.smpc.braking import Braking
 MAX_OVERDUE_ANSWERS = 3  # plans that took longer than a tick: one may be the computer's fault
 MAX_ANSWER_NS = 500_000_000  # half of the time after which a PX4 takes setpoints for gone
 MARGIN_PART = 0.5  # of the distance beyond the limits that a vehicle may be at
+GAIN_PART = 0.75  # of the braking gain that such a controller counts on: between two plans it may still accelerate
 
 
 class ExternalState(msgspec.Struct, frozen=True):
@@ -83,7 +84,7 @@ def make_braking(
         accel_mps2=np.array(limits.box_mps2)[index],
         lag_s=np.array(parameters.lag_s)[index],
         slew_mps3=limits.slew_mps3,
-        gain_1ps=fallback.brake_gain_1ps,
+        gain_1ps=GAIN_PART * fallback.brake_gain_1ps,
     )
 
 
