@@ -48,8 +48,8 @@ def test_a_controller_that_was_given_up_is_reported_once() -> None:
     assert after.fault == state.fault == first.text
 
 
-# The wall. Three quarters of the braking gain are 1 m/s² for each 1 m/s; 2 m/s² at most; a setpoint changes by 4 m/s² in
-# a second.
+# The wall. Three quarters of the gain brake by 1 m/s² for each 1 m/s; 2 m/s² at most; a setpoint changes by 4 m/s² in a
+# second.
 FALLBACK = FallbackParameters(
     brake_gain_1ps=4.0 / 3.0, brake_s=9.0, hold_s=9.0, blind_hold_s=9.0, land=False, recover_samples=3
 )

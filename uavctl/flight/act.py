@@ -17,6 +17,7 @@ from uavctl.arrays import Array
 from uavctl.flight.context import FilterView, TickContext, expand_axes, read_position, read_velocity
 from uavctl.flight.decide import (
     Decided,
+    are_positions_compared,
     carries_estimate,
     find_braking_velocity,
     find_hold_accel,
@@ -108,7 +109,9 @@ def _compute_fallback_accel(fallback: Fallback, context: TickContext, supervised
     moving, _ = find_braking_velocity(fallback, decided.biases, context, supervised)
     brake = compute_brake_accel(fallback, context.at_ns, moving, context.controller.fallback)
     hold = find_hold_accel(fallback, decided.biases, context, supervised)
-    back = find_return_accel(fallback, decided.hold_point_m, supervised.view, context.controller.plant)
+    # Positions that have just come back may be wrong: nothing leads back while they are compared.
+    point_m = None if are_positions_compared(context, supervised) else decided.hold_point_m
+    back = find_return_accel(fallback, point_m, supervised.view, context.controller.plant)
     # a = a_brake + a_hold + a_return
     wanted = brake[0] + hold[0] + back[0], brake[1] + hold[1] + back[1], brake[2] + hold[2] + back[2]
     if fallback.mode is not ControlMode.HOLD:

@@ -224,8 +224,7 @@ def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
         reason = f"age of information {view.age_steps} has reached H = {controller.horizon}"
         return _fall_back(draft, draft.fallback or begin_fallback(at_ns), phase, reason)
     wanted = controller.fallback.recover_samples
-    resumed_ns = phase.supervised.monitors.engaged.motion.resumed_ns
-    if draft.fallback is not None and resumed_ns is not None and at_ns - resumed_ns < COMPARED_NS:
+    if draft.fallback is not None and are_positions_compared(phase.context, phase.supervised):
         reason = "positions have come back, and their first second is compared"
         is_fresh = draft.consecutive_samples >= wanted
         fallback = restart_hold(draft.fallback, at_ns) if is_fresh else draft.fallback
@@ -408,6 +407,12 @@ def _is_velocity_lost(phase: _Phase) -> bool:
     return change.repeats(at_ns) or are_positions_lost(supervised.view.belief, at_ns)
 
 
+def are_positions_compared(context: TickContext, supervised: Supervised) -> bool:
+    """Whether positions have just come back after a silence, and are compared before anything is flown on them."""
+    resumed_ns = supervised.monitors.engaged.motion.resumed_ns
+    return resumed_ns is not None and context.at_ns - resumed_ns < COMPARED_NS
+
+
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
     """Whether the vehicle's own inertial data carry the estimate on, with nothing against it."""
     return not fallback.is_final and _is_inertial_new(belief)
@@ -443,9 +448,8 @@ def find_retreat_velocity(fallback: Fallback, context: TickContext, view: Filter
     bounds = context.controller.envelope
     if view.estimate is None or bounds is None or fallback.reason is FallbackReason.POSITIONS_DISTRUSTED:
         return ZERO
-    north, east, _ = bounds.upper_m  # the floor is no limit to retreat from
     position_m = read_position(view.estimate, context.controller.plant, math.nan)
-    return find_retreat(position_m, bounds.lower_m, (north, east, math.inf))
+    return find_retreat(position_m, bounds.lower_m, bounds.upper_m)
 
 
 def find_braking_velocity(

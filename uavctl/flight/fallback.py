@@ -188,10 +188,13 @@ def _limit_return(accel_mps2: float) -> float:
 
 
 def find_retreat(position_m: Vec3, lower_m: Vec3, upper_m: Vec3) -> Vec3:
-    """Find the velocity [m/s] away from the limits that the estimated position is near to; zero in other axes."""
+    """Find the velocity [m/s] away from the limits that the estimated position is near to; zero in other axes.
+
+    The floor is no limit to retreat from.
+    """
     north, east, down = (
         RETREAT_MPS * ((position - lower < NEAR_LIMIT_M) - (upper - position < NEAR_LIMIT_M))
-        for position, lower, upper in zip(position_m, lower_m, upper_m, strict=True)
+        for position, lower, upper in zip(position_m, lower_m, (*upper_m[:2], math.inf), strict=True)
     )
     return north, east, down
 
