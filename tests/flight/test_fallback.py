@@ -150,7 +150,7 @@ def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Ve
     assert compute_return_accel(off_m, velocity_mps) == pytest.approx(wanted, abs=1e-12)
 
 
-LOWER_M, UPPER_M = (-3.0, -2.0, -2.5), (3.0, 2.0, math.inf)
+LOWER_M, UPPER_M = (-3.0, -2.0, -2.5), (3.0, 2.0, 0.0)
 NEAR = NEAR_LIMIT_M - 1e-9
 
 
@@ -159,7 +159,7 @@ NEAR = NEAR_LIMIT_M - 1e-9
     [
         ((-3.0 + NEAR, 2.0 - NEAR, -2.5 + NEAR), (1.0, -1.0, 1.0)),
         ((-3.0 + NEAR_LIMIT_M, 2.0 - NEAR_LIMIT_M, -2.5 + NEAR_LIMIT_M), (0.0, 0.0, 0.0)),
-        ((3.4, -2.4, 0.0), (-1.0, 1.0, 0.0)),  # beyond both limits
+        ((3.4, -2.4, 0.0), (-1.0, 1.0, 0.0)),  # beyond both limits, on the floor: that is none
         ((math.nan, 0.0, math.nan), (0.0, 0.0, 0.0)),
     ],
 )
@@ -168,7 +168,7 @@ def test_near_a_limit_braking_ends_at_a_retreat_from_it(position_m: Vec3, wanted
 
 
 def test_between_two_near_limits_there_is_no_retreat() -> None:
-    assert find_retreat((0.0, 0.0, 0.0), (-0.4, -0.4, -math.inf), (0.4, 0.6, 0.4)) == (0.0, RETREAT_MPS, -RETREAT_MPS)
+    assert find_retreat((0.0, 0.0, 0.0), (-0.4, -0.4, -9.0), (0.4, 0.6, 9.0)) == (0.0, RETREAT_MPS, 0.0)
 
 
 def test_a_retreat_from_a_limit_is_no_drift_once_it_is_over() -> None:

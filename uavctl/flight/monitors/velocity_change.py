@@ -138,7 +138,7 @@ def _compare(
     gained = _subtract(last[2], first[2])
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t
     if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
-        return replace(state, agreed_ns=at_ns, disagrees_ns=None)
+        return replace(state, agreed_ns=at_ns if s >= LEAST_S else state.agreed_ns, disagrees_ns=None)
     right_mps = _subtract(first[1], first[3])
     if state.inertial_wrong_ns is not None:
         if is_right:
