@@ -390,6 +390,13 @@ def test_setpoints_support_the_velocity_within_gusts_from_half_a_second_on(
     assert (both.agreed_ns, both.velocity_wrong_ns) == (None, START_NS)
 
 
+def test_inertial_data_support_the_velocity_from_half_a_second_on() -> None:
+    # Over less, a mirrored velocity changes alike, too.
+    for ns, agreed_ns in ((HALF_S_NS, START_NS + HALF_S_NS), (HALF_S_NS - 1, None)):
+        state = compare(ZERO, ZERO, ns=ns)
+        assert (state.agreed_ns, state.disagrees_ns) == (agreed_ns, None)
+
+
 def test_changes_are_compared_whatever_the_velocities_were_at_first() -> None:
     at_first = (north(1.0), north(2.0), north(4.0))
     state = compare(north(1.5), north(2.5), first=at_first, model=north(4.5))
