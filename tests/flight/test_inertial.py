@@ -527,7 +527,7 @@ def test_positions_are_wrong_where_inertial_data_and_the_vehicle_s_own_velocity_
 
 
 def go_silent(left_m: float, until_s: float) -> list[float]:
-    """Times [s] of braking of a vehicle at rest whose inertial data alone come after 2 s; its own velocity until a time.
+    """Times [s] of braking of a vehicle at rest; after 2 s no position comes, after another its own velocity.
 
     Args:
         left_m: Distance of a limit.
@@ -559,6 +559,29 @@ def test_inertial_data_alone_fly_no_plan_near_a_limit_once_the_own_velocity_has_
     assert 2.4 < min(go_silent(left_m=0.45, until_s=1.9)) < 2.6
     # Far from limits they do, and where the own velocity comes, or never came.
     assert not go_silent(left_m=2.0, until_s=1.9) and not go_silent(0.45, 9.0) and not go_silent(0.45, 0.0)
+
+
+@pytest.mark.fault(94)
+def test_nothing_leads_back_while_positions_that_came_back_are_compared() -> None:
+    envelope = replace(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3)
+    controller = replace(controller_that_feels(), envelope=envelope)
+    state, held_mps2 = make_initial_state(), []
+    for tick in range(5 * 20):
+        at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
+        noise, is_back = 0.001 * (tick % 7), s > 4.0
+        given = StepInput(
+            tick=tick,
+            at_ns=at_ns,
+            samples=() if 1.0 < s <= 4.0 else (sample(at_ns, position_m=(noise + 0.4 * is_back, 0.0, 0.0)),),
+            vehicle=vehicle(),
+            motion=motion((noise, 0.0, 0.0), at_ns),
+            inertial=felt_at(at_ns - MS, noise),
+        )
+        state, one = run_tick(state, given, controller)
+        if one.decision.mode == "hold" and one.setpoint is not None and s > 4.5:
+            held_mps2.append(abs(one.setpoint.accel_mps2[0]))
+    # The way back would ask for 0.4 m/s² more than the estimated bias, which is flown against.
+    assert len(held_mps2) > 5 and max(held_mps2) < 0.4
 
 
 def blow(*, moves: bool = True, has_velocity: bool = True, left_m: float = 9.0) -> list[TickOutput]:
