@@ -213,6 +213,9 @@ def _judge_estimate(
         compares = returned_ns >= CORRECTS_NS
         if is_new or (is_recent and (has_drifted or (compares and _is_apart(state, belief, view, context)))):
             return _POSITIONS_CONTRADICTED, NO_VERDICT
+    is_alone = inertial.contradict_model_alone(belief.inertial) and _is_velocity_silent(context)
+    if is_alone and are_positions_lost(belief, context.at_ns):
+        return NO_VERDICT, inertial.distrust(belief.inertial, context.at_ns)[1]
     consistent = change.inertial_wrong_ns is None and not has_drifted
     comparison = InertialObservation(ComparedSource.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
     return NO_VERDICT, inertial.update(belief.inertial, comparison)[1]

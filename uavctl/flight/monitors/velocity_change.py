@@ -36,6 +36,7 @@ from uavctl.records import Vector
 WINDOW_NS = 1_000_000_000  # longer integrals of inertial data drift, over shorter ones a change is small
 PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one message may be late
 INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
+NEARER = 3.0  # times as near to the setpoints as the own velocity: inertial data do not come so near by chance
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 LEAST_S = 0.5  # over less, setpoints alone say nothing of an own velocity
 RECENT_NS = 300_000_000  # an agreement counts for so long
@@ -136,8 +137,10 @@ def _compare(
     if first[2] is None or last[2] is None:
         return supported
     gained = _subtract(last[2], first[2])
-    # |Δv - Δi| ≤ v_max + 0.3 m/s² t
-    if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + INERTIAL_DRIFT_MPS2 * s:
+    gained_mps = min(math.dist(gained, model), math.dist(gained, pushed))
+    # |Δv - Δi| ≤ v_max + 0.3 m/s² t; inertial data that are right by the setpoints do not drift
+    drift_mps = INERTIAL_DRIFT_MPS2 * s if own_mps < NEARER * gained_mps else 0.0
+    if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + drift_mps:
         return replace(state, agreed_ns=at_ns if s >= LEAST_S else state.agreed_ns, disagrees_ns=None)
     right_mps = _subtract(first[1], first[3])
     if state.inertial_wrong_ns is not None:
@@ -149,7 +152,6 @@ def _compare(
     disagrees_ns = at_ns if state.disagrees_ns is None else state.disagrees_ns
     if at_ns - disagrees_ns < PERSISTS_NS:
         return replace(state, disagrees_ns=disagrees_ns)
-    gained_mps = min(math.dist(gained, model), math.dist(gained, pushed))
     if state.velocity_wrong_ns is not None:
         return replace(state, inertial_wrong_ns=at_ns if gained_mps > explained_mps else None)
     are_both_wrong = min(own_mps, gained_mps) > explained_mps
