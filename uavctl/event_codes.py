@@ -67,6 +67,7 @@ class EventCode(StrEnum):
     INERTIAL_SILENT = "inertial-silent"
     INERTIAL_USED = "inertial-used"
     INERTIAL_STALE = "inertial-not-of-now"  # late, repeated, or frozen [connection]
+    VELOCITY_STALE = "velocity-not-of-now"  # the vehicle's own, late by its stamp [connection]
     # Link model
     LINK_BURSTS = "link-bursts"
     LINK_BELOW_DESIGN = "link-below-promise"

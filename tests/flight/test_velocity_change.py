@@ -313,10 +313,19 @@ def compare(
 @pytest.mark.parametrize(("ns", "bound_mps"), [(HALF_S_NS, AGREE_MPS), (2 * HALF_S_NS, 0.25 + 0.3)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_changes_agree_up_to_a_bound_that_grows_with_time(ns: int, bound_mps: float, sign: float) -> None:
-    at_bound = compare(north(sign * bound_mps), ZERO, ns=ns)
+    at_bound = compare(north(sign * bound_mps), ZERO, ns=ns, model=north(sign * 0.3 * bound_mps))
     assert (at_bound.agreed_ns, at_bound.disagrees_ns) == (START_NS + ns, None)
     beyond = compare(ZERO, north(sign * just_more(bound_mps)), ns=ns, disagrees_ns=None)
     assert (beyond.agreed_ns, beyond.disagrees_ns) == (None, START_NS + ns)
+
+
+@pytest.mark.parametrize(("model_mps", "agrees"), [(0.1, True), (0.09, False)])
+def test_inertial_data_three_times_as_near_to_setpoints_do_not_drift(model_mps: float, agrees: bool) -> None:
+    own_mps = 0.39  # less than 0.25 m/s and half a second of drift; |Δv - Δm| = 0.29 < 3 |Δi - Δm|, or 0.30
+    state = compare(north(own_mps), ZERO, model=north(model_mps))
+    assert (state.agreed_ns is not None) == agrees == (state.disagrees_ns is None)
+    # So far apart that nothing but the drift explains it.
+    assert compare(north(0.25), ZERO, model=ZERO).agreed_ns is not None
 
 
 @pytest.mark.parametrize(("for_ns", "finds"), [(50 * MS - 1, False), (50 * MS, True)])

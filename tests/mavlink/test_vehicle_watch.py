@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from uavctl.config.connections import DaemonConfig
 from uavctl.config.types import EstimatorConfig
+from uavctl.event_codes import EventCode
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.vehicle import ALONE_NS, FROZEN_RAW_US, GONE_NS, MAX_ATTITUDE_AGE_NS, SensorStreamMonitor
-from uavctl.records import InertialSample, VehicleStatus
+from uavctl.records import InertialSample, VehicleMotion, VehicleStatus
 
 NOW = 1000 * SECOND
 MS = 1_000_000
@@ -140,8 +141,25 @@ def test_garbage_in_a_time_since_boot_is_no_restart() -> None:
 )
 def test_disorder_the_wrap_and_gaps_are_no_restarts(before_ms: int, after_ms: int) -> None:
     link, vehicle = heard(before_ms)
-    assert not events(link.receive(vehicle.local_position(after_ms), NOW + SECOND).items)
+    told = events(link.receive(vehicle.local_position(after_ms), NOW + SECOND).items)
+    assert EventCode.VEHICLE_REBOOT not in [event.code for event in told]
     assert newest(link, vehicle).boots == 0
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(("late_ms", "counts"), [(300, True), (350, False)])
+def test_a_velocity_that_its_stamp_calls_old_is_not_used(late_ms: int, counts: bool) -> None:
+    link, vehicle = heard()
+    for n in range(1, 40):
+        late = late_ms if n >= 20 else 0
+        items = link.receive(vehicle.local_position(60_000 + 100 * n - late), NOW + 100 * n * MS).items
+        (motion,) = [item for item in items if isinstance(item, VehicleMotion)] or [None]
+        assert (motion is not None) == (counts or n < 20), n
+    assert link.stats(NOW).bad.get("velocity-not-of-now", 0) == (0 if counts else 20)
+    # A restart begins a new clock.
+    link.receive(vehicle.local_position(1), NOW + 5 * SECOND)
+    items = link.receive(vehicle.local_position(101), NOW + 5 * SECOND + 100 * MS).items
+    assert any(isinstance(item, VehicleMotion) for item in items)
 
 
 @pytest.mark.fault(60)

@@ -48,6 +48,7 @@ BOOTING_NS = 3_000_000_000  # silence before a heartbeat of booting that shows a
 MAX_ATTITUDE_AGE_NS = 100_000_000  # at 1 rad/s the attitude is then 0.1 rad off, and the acceleration 1 m/s²
 GRAVITY_MPS2 = 9.80665
 MAX_DELAY_NS = 60_000_000  # later than the quickest message: a stream of 50 Hz has 20 ms between messages
+MAX_VELOCITY_DELAY_NS = 300_000_000  # a velocity that is older is used for nothing, however late it comes
 MAX_BACKSTEP_US = 1_000_000  # a stamp that goes back by more is of another clock
 _UNREPORTED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 # PX4 is in standby only while its pre-flight checks pass, else uninitialised. That changes without a restart.
@@ -102,17 +103,22 @@ class SensorStreamMonitor:
             values: the readings.
             frozen_us: identical readings for longer come from a frozen sensor; 0 if noise never repeats.
         """
+        if -MAX_BACKSTEP_US <= stamp_us - self._stamp_us <= 0:
+            return None
+        delay_ns = self.measure_delay_ns(stamp_us, at_ns)
+        is_repeated = values == self._values
+        if not is_repeated:
+            self._since_us = stamp_us
+        self._values = values
+        return delay_ns <= MAX_DELAY_NS and not (is_repeated and stamp_us - self._since_us >= frozen_us)
+
+    def measure_delay_ns(self, stamp_us: int, at_ns: int) -> int:
+        """Return the delay of a message behind the quickest one [ns]; a stamp of another clock starts anew."""
         advance_us = stamp_us - self._stamp_us
         if advance_us < -MAX_BACKSTEP_US or advance_us > (at_ns - self._checked_ns) // 1000 + MAX_BACKSTEP_US:
             self._clock, self._since_us = ArrivalClock(), stamp_us
-        elif advance_us <= 0:
-            return None
-        if values != self._values:
-            self._since_us = stamp_us
-        is_repeated = values == self._values
-        delay_ns = self._clock.measure_delay_ns(1000 * stamp_us, at_ns)
-        self._stamp_us, self._checked_ns, self._values = stamp_us, at_ns, values
-        return delay_ns <= MAX_DELAY_NS and not (is_repeated and stamp_us - self._since_us >= frozen_us)
+        self._stamp_us, self._checked_ns = stamp_us, at_ns
+        return self._clock.measure_delay_ns(1000 * stamp_us, at_ns)
 
 
 class VehicleMonitor:
@@ -202,6 +208,9 @@ class VehicleMonitor:
                 return self._update_evidence(at_ns)
             case Position(boot_ms=True, stamp_us=int(stamp_us)):
                 status = self._update_boot_clock("position", stamp_us, at_ns)
+                if self._find_stream("velocity").measure_delay_ns(stamp_us, at_ns) > MAX_VELOCITY_DELAY_NS and stamp_us:
+                    self._count_bad(EventCode.VELOCITY_STALE)
+                    return status
                 return (*status, *self._update_motion(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad):
                 if message.rates_rps is not None:
