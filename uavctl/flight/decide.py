@@ -475,7 +475,8 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
     if observation is not None and observation.own_mps is not None and judge_vehicle_velocity(observation).is_none:
         own = _select_known(observation.own_mps, plant)
         # v_own' v_predicted < 0
-        if sum(map(operator.mul, own, predicted)) < 0.0:
+        is_confirmed = monitors.velocity_change.confirms_velocity(context.at_ns)
+        if not is_confirmed and sum(map(operator.mul, own, predicted)) < 0.0:
             if not are_positions_lost(belief, context.at_ns):
                 own = predicted
             elif _is_inertial_new(belief):
@@ -483,7 +484,9 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
         return own, True
     change, bias = monitors.velocity_change, find_lasting_bias(biases)
     right = change.right_beside_model_mps
-    if right is None or _is_inertial_new(belief) or not are_positions_lost(belief, context.at_ns):
+    is_carried = _is_inertial_new(belief)
+    is_wrong = change.velocity_wrong_ns is not None
+    if right is None or (is_wrong and is_carried) or not are_positions_lost(belief, context.at_ns):
         return predicted, False
     wind_mps2 = plant.to_accel(np.array(bias)) if bias else ZERO
     s = (context.at_ns - (change.right_ns or context.at_ns)) * 1e-9

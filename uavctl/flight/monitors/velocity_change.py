@@ -56,11 +56,12 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
 
     samples: tuple[Sample, ...] = ()  # of the window, oldest first
     agreed_ns: int | None = None  # when both changes last agreed [ns]; None before
+    confirmed_ns: int | None = None  # when both last agreed on a change that a wrong velocity would not have [ns]
     disagrees_ns: int | None = None  # time since which they do not [ns]; None while they do
     repeated: tuple[Vector, Vector, int] | None = None  # the own velocity, the model's when it first came, that time
     velocity_wrong_ns: int | None = None  # when the own velocity was found wrong [ns]; None while it is not
     inertial_wrong_ns: int | None = None  # when inertial data were found wrong [ns]; None while they are not
-    # The last own velocity that was right, less the model's then [m/s]; None while the own velocity is right
+    # The last own velocity that was right, less the model's then [m/s]; None while a right one comes
     right_beside_model_mps: Vector | None = None
     right_ns: int | None = None  # its time [ns]
 
@@ -82,6 +83,10 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
         """Whether inertial data, or setpoints without right ones, have changed as the own velocity has, just now."""
         return self.velocity_wrong_ns is None and self.agreed_ns is not None and at_ns - self.agreed_ns <= RECENT_NS
 
+    def confirms_velocity(self, at_ns: int) -> bool:
+        """Whether inertial data have changed as the own velocity has within the last second, and by much."""
+        return not self.contradicts and self.confirmed_ns is not None and at_ns - self.confirmed_ns <= WINDOW_NS
+
 
 def update(state: VelocityChangeState, observation: TickObservation, velocity: VelocityState) -> VelocityChangeState:
     """Take a tick, after its positions."""
@@ -95,6 +100,8 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
         # What was found before positions came back counts: both changes are not compared while they correct one.
         last_ns = state.disagrees_ns + PERSISTS_NS
         state = _compare(state, state.samples[0], state.samples[-1], unexplained, last_ns, parameters)
+    if state.velocity_wrong_ns is None:
+        state = _remember_right(state, is_silent=own is None)
     if own is None or own_ns is None or is_corrected:
         return replace(state, samples=(), disagrees_ns=None, repeated=None)
     state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
@@ -141,7 +148,13 @@ def _compare(
     # |Δv - Δi| ≤ v_max + 0.3 m/s² t; inertial data that are right by the setpoints do not drift
     drift_mps = INERTIAL_DRIFT_MPS2 * s if own_mps < NEARER * gained_mps else 0.0
     if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + drift_mps:
-        return replace(state, agreed_ns=at_ns if s >= LEAST_S else state.agreed_ns, disagrees_ns=None)
+        is_plain = math.hypot(*gained) > 2.0 * parameters.disagreement_mps
+        return replace(
+            state,
+            agreed_ns=at_ns if s >= LEAST_S else state.agreed_ns,
+            confirmed_ns=at_ns if s >= LEAST_S and is_plain else state.confirmed_ns,
+            disagrees_ns=None,
+        )
     right_mps = _subtract(first[1], first[3])
     if state.inertial_wrong_ns is not None:
         if is_right:
@@ -193,6 +206,14 @@ def _judge_alone(
         return state
     right_mps = _subtract(before, model_before)
     return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps, right_ns=before_ns)
+
+
+def _remember_right(state: VelocityChangeState, *, is_silent: bool) -> VelocityChangeState:
+    """Remember the last own velocity once it is silent, and forget it once it comes again."""
+    if is_silent and state.samples:
+        at_ns, own, _, model = state.samples[-1]
+        return replace(state, right_beside_model_mps=_subtract(own, model), right_ns=at_ns)
+    return state if is_silent else replace(state, right_beside_model_mps=None, right_ns=None)
 
 
 def _believe_again(
