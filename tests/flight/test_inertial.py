@@ -526,41 +526,6 @@ def test_positions_are_wrong_where_inertial_data_and_the_vehicle_s_own_velocity_
     assert 2.0 < min(braked[0.3]) < 2.5
 
 
-def go_silent(left_m: float, until_s: float) -> list[float]:
-    """Times [s] of braking of a vehicle at rest; after 2 s no position comes, after another its own velocity.
-
-    Args:
-        left_m: Distance of a limit.
-        until_s: The own velocity comes before this time.
-    """
-    envelope = replace(PARAMETERS, axes=(True, False, False), upper_m=(left_m, 9.0, 9.0))
-    controller = replace(controller_that_feels(), envelope=envelope)
-    state, braked_s, moved = make_initial_state(), [], None
-    for tick in range(54):
-        at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
-        noise = 0.001 * (tick % 7)
-        moved = motion((noise, 0.0, 0.0), at_ns) if s < until_s else moved
-        given = StepInput(
-            tick=tick,
-            at_ns=at_ns,
-            samples=(sample(at_ns, position_m=(noise, 0.0, 0.0)),) if s <= 2.0 else (),
-            vehicle=vehicle(),
-            motion=moved,
-            inertial=felt_at(at_ns - MS, noise),
-        )
-        state, one = run_tick(state, given, controller)
-        if one.decision.mode == "brake":
-            braked_s.append(s)
-    return braked_s
-
-
-@pytest.mark.fault(94)
-def test_inertial_data_alone_fly_no_plan_near_a_limit_once_the_own_velocity_has_stopped() -> None:
-    assert 2.4 < min(go_silent(left_m=0.45, until_s=1.9)) < 2.6
-    # Far from limits they do, and where the own velocity comes, or never came.
-    assert not go_silent(left_m=2.0, until_s=1.9) and not go_silent(0.45, 9.0) and not go_silent(0.45, 0.0)
-
-
 @pytest.mark.fault(94)
 def test_nothing_leads_back_while_positions_that_came_back_are_compared() -> None:
     envelope = replace(PARAMETERS, axes=(True, False, False), unexplained_mps2=1e3)

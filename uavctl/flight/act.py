@@ -29,7 +29,7 @@ from uavctl.flight.kalman import read_capture_ns
 from uavctl.flight.limits import ZERO, limit_setpoint
 from uavctl.flight.measure import Measured
 from uavctl.flight.state import ControlState
-from uavctl.flight.supervise import Supervised, is_velocity_silent
+from uavctl.flight.supervise import Supervised
 from uavctl.flight.yaw import YawMode, compute_yaw
 from uavctl.records import ControlMode, Setpoint, SetpointSource, Vec3
 from uavctl.smpc.plant import Plant
@@ -109,9 +109,8 @@ def _compute_fallback_accel(fallback: Fallback, context: TickContext, supervised
     moving, _ = find_braking_velocity(fallback, decided.biases, context, supervised)
     brake = compute_brake_accel(fallback, context.at_ns, moving, context.controller.fallback)
     hold = find_hold_accel(fallback, decided.biases, context, supervised)
-    # Nothing leads back while positions are compared that have just come back, or where nothing checks inertial data.
-    is_unchecked = are_positions_compared(context, supervised) or is_velocity_silent(context)
-    point_m = None if is_unchecked else decided.hold_point_m
+    # Positions that have just come back may be wrong: nothing leads back while they are compared.
+    point_m = None if are_positions_compared(context, supervised) else decided.hold_point_m
     back = find_return_accel(fallback, point_m, supervised.view, context.controller.plant)
     # a = a_brake + a_hold + a_return
     wanted = brake[0] + hold[0] + back[0], brake[1] + hold[1] + back[1], brake[2] + hold[2] + back[2]

@@ -484,9 +484,7 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
         return own, True
     change, bias = monitors.velocity_change, find_lasting_bias(biases)
     right = change.right_beside_model_mps
-    is_carried = _is_inertial_new(belief)
-    is_wrong = change.velocity_wrong_ns is not None
-    if right is None or (is_wrong and is_carried) or not are_positions_lost(belief, context.at_ns):
+    if right is None or _is_inertial_new(belief) or not are_positions_lost(belief, context.at_ns):
         return predicted, False
     wind_mps2 = plant.to_accel(np.array(bias)) if bias else ZERO
     s = (context.at_ns - (change.right_ns or context.at_ns)) * 1e-9

@@ -47,7 +47,7 @@ from uavctl.flight.estimator import (
     predict_ahead,
     predict_belief,
 )
-from uavctl.flight.fallback import FallbackReason, find_retreat
+from uavctl.flight.fallback import FallbackReason
 from uavctl.flight.kalman import Belief, read_capture_ns
 from uavctl.flight.limits import ZERO
 from uavctl.flight.measure import Measured
@@ -90,10 +90,6 @@ _POSITIONS_CONTRADICTED = brake(
 )
 _CARRIED_BY_NOTHING = brake(
     EventCode.PREDICTION_INCONSISTENT, "no position comes, and inertial data do not either, or are doubted"
-)
-_UNCHECKED = brake(
-    EventCode.PREDICTION_INCONSISTENT,
-    "near a limit, neither a position nor the vehicle's own velocity comes: nothing checks its inertial data",
 )
 _ABSURD_SO_FAR = brake(
     EventCode.POSITIONS_ABSURD,
@@ -213,7 +209,7 @@ def _judge_estimate(
         compares = returned_ns >= CORRECTS_NS
         if is_new or (is_recent and (has_drifted or (compares and _is_apart(state, belief, view, context)))):
             return _POSITIONS_CONTRADICTED, NO_VERDICT
-    is_alone = inertial.contradict_model_alone(belief.inertial) and is_velocity_silent(context)
+    is_alone = inertial.contradict_model_alone(belief.inertial) and _is_velocity_silent(context)
     if is_alone and are_positions_lost(belief, context.at_ns):
         return NO_VERDICT, inertial.distrust(belief.inertial, context.at_ns)[1]
     consistent = change.inertial_wrong_ns is None and not has_drifted
@@ -362,11 +358,9 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
     is_wrong = change.inertial_wrong_ns is not None or trust.distrusted_ns is not None
     is_lost = is_wrong or context.at_ns - (trust.used_ns or context.at_ns) > LOST_NS
     is_wind = inertial.contradict_model_alone(trust) and _are_supported(change, context.at_ns)
-    if not are_positions_lost(view.belief, context.at_ns):
+    if not is_lost or (is_wind and not _is_near_limit(view, context)):
         return NO_VERDICT
-    if is_lost:
-        return NO_VERDICT if is_wind and not _is_near_limit(view, context) else _CARRIED_BY_NOTHING
-    return _UNCHECKED if is_velocity_silent(context) and _is_near_limit(view, context) else NO_VERDICT
+    return _CARRIED_BY_NOTHING if are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
 
 
 def _are_supported(change: VelocityChangeState, at_ns: int) -> bool:
@@ -375,7 +369,7 @@ def _are_supported(change: VelocityChangeState, at_ns: int) -> bool:
     return has_both and not change.contradicts and change.supports_velocity(at_ns)
 
 
-def is_velocity_silent(context: TickContext) -> bool:
+def _is_velocity_silent(context: TickContext) -> bool:
     """Whether the vehicle's own velocity has come, and does not any more."""
     motion = context.inputs.motion
     has_come = motion is not None and motion.velocity_ns is not None
@@ -383,14 +377,12 @@ def is_velocity_silent(context: TickContext) -> bool:
 
 
 def _is_near_limit(view: FilterView, context: TickContext) -> bool:
-    """Whether the vehicle reaches a limit within `NEAR_S` by its own velocity; without that, whether it is near one."""
+    """Whether the vehicle reaches a limit within `NEAR_S` by its own velocity: a wrong response may look like wind."""
     bounds, own = context.controller.envelope, read_vehicle_velocity(context.inputs.motion, context.at_ns)
-    if bounds is None:
+    if bounds is None or own is None:
         return True
-    tick = observe_motion(view.estimate, context, ZERO)
-    approaches = outside.list_approaches(tick, bounds, own or tick.velocity_mps)
-    is_near = own is None and find_retreat(tick.position_m or (math.nan,) * 3, bounds.lower_m, bounds.upper_m) != ZERO
-    return is_near or any(approach.distance_m < NEAR_S * approach.speed_mps for approach in approaches)
+    approaches = outside.list_approaches(observe_motion(view.estimate, context, ZERO), bounds, own)
+    return any(approach.distance_m < NEAR_S * approach.speed_mps for approach in approaches)
 
 
 def are_positions_lost(belief: Belief | None, at_ns: int) -> bool:

@@ -8,6 +8,7 @@
    the setpoints; both are, if both are further than gusts explain. Where Δv is known to be wrong, only Δi is compared.
 4. An own velocity that repeats to the last bit while Δm grows is wrong, too. So is one that leaps from one message to
    the next by more than Δm and gusts explain. Once inertial data are known to be wrong, half as much is a proof.
+5. Where the own velocity has stopped, Δi that is further from Δm than gusts explain is wrong.
 
 A wrong velocity is not braked on, and wrong inertial data do not carry the estimate on. The own velocity that was right
 before is kept: with Δm it is the best that is known without a position. Where no position comes, the vehicle brakes
@@ -36,6 +37,8 @@ from uavctl.records import Vector
 WINDOW_NS = 1_000_000_000  # longer integrals of inertial data drift, over shorter ones a change is small
 PERSISTS_NS = 50_000_000  # time for which a disagreement has to last: one message may be late
 INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degrees
+# Bounds of gusts, for inertial data that nothing but setpoints checks: with 1.0, 1 of 40 flights without a lie braked.
+LONE_GUSTS = 1.2
 NEARER = 3.0  # times as near to the setpoints as the own velocity: inertial data do not come so near by chance
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
 LEAST_S = 0.5  # over less, setpoints alone say nothing of an own velocity
@@ -55,6 +58,8 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     """State of the monitor."""
 
     samples: tuple[Sample, ...] = ()  # of the window, oldest first
+    # Time [ns], integral of inertial data, model's [m/s], of the window, where no own velocity comes; oldest first
+    lone: tuple[tuple[int, Vector, Vector], ...] = ()
     agreed_ns: int | None = None  # when both changes last agreed [ns]; None before
     confirmed_ns: int | None = None  # when both last agreed on a change that a wrong velocity would not have [ns]
     disagrees_ns: int | None = None  # time since which they do not [ns]; None while they do
@@ -102,12 +107,15 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
         state = _compare(state, state.samples[0], state.samples[-1], unexplained, last_ns, parameters)
     if state.velocity_wrong_ns is None:
         state = _remember_right(state, is_silent=own is None)
-    if own is None or own_ns is None or is_corrected:
-        return replace(state, samples=(), disagrees_ns=None, repeated=None)
-    state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
     gained: Vector | None = None
     if motion.inertial_path and tick.inertial_mps2 is not None:
-        gained = tuple(motion.inertial_path[-1].integrate(own_ns)[0])
+        gained = tuple(motion.inertial_path[-1].integrate(tick.at_ns if own is None else own_ns or tick.at_ns)[0])
+    if own is None or own_ns is None or is_corrected:
+        state = replace(state, samples=(), disagrees_ns=None, repeated=None)
+        if own is not None or gained is None or is_corrected:
+            return state
+        return _judge_lone_inertial(state, (tick.at_ns, gained, motion.model_mps), unexplained, parameters)
+    state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
     if state.samples and (state.samples[-1][2] is None) != (gained is None):
         state = replace(state, samples=(), disagrees_ns=None)
     if state.samples and state.samples[-1][0] >= own_ns:
@@ -208,12 +216,32 @@ def _judge_alone(
     return replace(state, velocity_wrong_ns=at_ns, right_beside_model_mps=right_mps, right_ns=before_ns)
 
 
+def _judge_lone_inertial(
+    state: VelocityChangeState,
+    sample: tuple[int, Vector, Vector],
+    unexplained_mps2: Vector,
+    parameters: EnvelopeParameters,
+) -> VelocityChangeState:
+    """Find inertial data wrong that change otherwise than setpoints and gusts explain, where no own velocity comes."""
+    lone = (*(one for one in state.lone if sample[0] - one[0] <= WINDOW_NS), sample)
+    state = replace(state, lone=lone)
+    (first_ns, first_gained, first_model), (at_ns, gained, model) = lone[0], sample
+    s = (at_ns - first_ns) * 1e-9
+    model_change, change = _subtract(model, first_model), _subtract(gained, first_gained)
+    pushed = [m + accel * s for m, accel in zip(model_change, unexplained_mps2, strict=True)]
+    # |Δi - Δm| > 1.2 (v_max + gusts(t))
+    gusts_mps = LONE_GUSTS * (parameters.disagreement_mps + bound_gusts_mps(s, parameters))
+    if state.right_ns is None or min(math.dist(change, model_change), math.dist(change, pushed)) <= gusts_mps:
+        return state
+    return replace(state, inertial_wrong_ns=at_ns, lone=())
+
+
 def _remember_right(state: VelocityChangeState, *, is_silent: bool) -> VelocityChangeState:
     """Remember the last own velocity once it is silent, and forget it once it comes again."""
     if is_silent and state.samples:
         at_ns, own, _, model = state.samples[-1]
         return replace(state, right_beside_model_mps=_subtract(own, model), right_ns=at_ns)
-    return state if is_silent else replace(state, right_beside_model_mps=None, right_ns=None)
+    return state if is_silent else replace(state, lone=(), right_beside_model_mps=None, right_ns=None)
 
 
 def _believe_again(
