@@ -406,6 +406,78 @@ def test_inertial_data_support_the_velocity_from_half_a_second_on() -> None:
         assert (state.agreed_ns, state.disagrees_ns) == (agreed_ns, None)
 
 
+@pytest.mark.parametrize(
+    ("gained_mps", "ns", "is_confirmed"),
+    [(0.5, HALF_S_NS, False), (0.501, HALF_S_NS, True), (0.501, HALF_S_NS - 1, False)],
+)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_large_change_that_both_show_confirms_the_velocity_for_a_second(
+    gained_mps: float, ns: int, is_confirmed: bool, sign: float
+) -> None:
+    state = compare(*(north(sign * gained_mps),) * 2, ns=ns)
+    at_ns = START_NS + ns
+    assert state.confirms_velocity(at_ns) == is_confirmed == state.confirms_velocity(at_ns + 1_000_000_000)
+    assert not state.confirms_velocity(at_ns + 1_000_000_001)
+    later = structs.replace(state, disagrees_ns=at_ns)
+    assert not later.confirms_velocity(at_ns)
+
+
+LONE_MPS = 1.2 * GUSTS_MPS
+
+
+def fall_silent(
+    gained: Vec3 | None, *, own: Vec3 | None = None, pushed_mps2: Vec3 = ZERO, **known: Any
+) -> VelocityChangeState:
+    """Take a tick without an own velocity, half a second after the first such one."""
+    at_ns = START_NS + HALF_S_NS
+    path = () if gained is None else (InertialSpan(at_ns, ZERO, gained, ZERO),)
+    observer = Observer(at_ns, np.array([ZERO, ZERO, pushed_mps2]), np.zeros((3, 3)), np.zeros(3))
+    moved = Motion(tick_ns=at_ns, model_mps=north(2.0), inertial_path=path, observer=observer)
+    tick = structs.replace(
+        seen(at_ns, vehicle_motion=None if own is None else motion(own, at_ns)),
+        inertial_mps2=None if gained is None else ZERO,
+    )
+    before: dict[str, Any] = {"right_ns": START_NS, "lone": ((START_NS, north(1.0), north(2.0)),), **known}
+    return update(VelocityChangeState(**before), TickObservation(tick, moved, PARAMETERS), NO_POSITIONS)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_where_the_own_velocity_has_stopped_setpoints_check_inertial_data(sign: float) -> None:
+    off_mps = sign * LONE_MPS
+    assert is_found(fall_silent(north(1.0 + off_mps * (1.0 - 1e-9)))) == (False, False)
+    assert is_found(fall_silent(north(1.0 + off_mps * (1.0 + 1e-9)))) == (False, True)
+    # The acceleration that positions showed may last, or not.
+    for gained_mps in (0.0, sign * 2.0):
+        assert is_found(fall_silent(north(1.0 + gained_mps), pushed_mps2=north(sign * 4.0))) == (False, False)
+
+
+def test_nothing_is_found_where_no_own_velocity_ever_came_or_no_inertial_data_do() -> None:
+    assert is_found(fall_silent(north(9.0), right_ns=None)) == is_found(fall_silent(None)) == (False, False)
+    comes = fall_silent(north(9.0), own=north(1.0))
+    assert is_found(comes) == (False, False) and comes.lone == ()
+
+
+def test_lone_inertial_data_are_compared_over_a_second() -> None:
+    long_ago = (START_NS - HALF_S_NS - 1, north(-9.0), north(2.0))
+    state = fall_silent(north(1.0), lone=(long_ago, (START_NS - HALF_S_NS, north(1.0), north(2.0))))
+    assert is_found(state) == (False, False) and [at_ns for at_ns, *_ in state.lone] == [
+        START_NS - HALF_S_NS,
+        START_NS + HALF_S_NS,
+    ]
+    assert is_found(fall_silent(north(1.0), lone=((START_NS - HALF_S_NS, north(-9.0), north(2.0)),))) == (False, True)
+
+
+def test_the_last_own_velocity_is_remembered_once_it_stops_and_forgotten_once_it_comes() -> None:
+    sample = (START_NS, north(1.5), ZERO, north(0.5))
+    state = fall_silent(north(1.0), samples=(sample,), right_ns=None)
+    assert (state.right_beside_model_mps, state.right_ns) == (north(1.0), START_NS)
+    again = fall_silent(north(1.0), own=north(1.0), right_beside_model_mps=north(1.0))
+    assert (again.right_beside_model_mps, again.right_ns) == (None, None)
+    wrong = fall_silent(north(1.0), samples=(sample,), velocity_wrong_ns=START_NS, right_beside_model_mps=north(3.0))
+    assert wrong.right_beside_model_mps == north(3.0)
+
+
 def test_changes_are_compared_whatever_the_velocities_were_at_first() -> None:
     at_first = (north(1.0), north(2.0), north(4.0))
     state = compare(north(1.5), north(2.5), first=at_first, model=north(4.5))
