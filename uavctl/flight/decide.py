@@ -42,7 +42,7 @@ from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.risk import set_risk
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
-from uavctl.flight.supervise import Supervised, are_positions_lost, observe_velocity
+from uavctl.flight.supervise import Supervised, are_positions_lost, is_velocity_silent, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.plant import Plant
@@ -226,7 +226,8 @@ def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
     wanted = controller.fallback.recover_samples
     if draft.fallback is not None and are_positions_compared(phase.context, phase.supervised):
         reason = "positions have come back, and their first second is compared"
-        is_fresh = draft.consecutive_samples >= wanted
+        # Without the own velocity, the time to hold runs on.
+        is_fresh = draft.consecutive_samples >= wanted and not is_velocity_silent(phase.context)
         fallback = restart_hold(draft.fallback, at_ns) if is_fresh else draft.fallback
         return _fall_back(draft, fallback, phase, reason)
     if draft.fallback is not None and draft.consecutive_samples < wanted:
@@ -408,9 +409,12 @@ def _is_velocity_lost(phase: _Phase) -> bool:
 
 
 def are_positions_compared(context: TickContext, supervised: Supervised) -> bool:
-    """Whether positions have just come back after a silence, and are compared before anything is flown on them."""
+    """Whether positions have just come back after a silence, and are compared before anything is flown on them.
+
+    Without the vehicle's own velocity, if that has come before, there is nothing to compare them with yet.
+    """
     resumed_ns = supervised.monitors.engaged.motion.resumed_ns
-    return resumed_ns is not None and context.at_ns - resumed_ns < COMPARED_NS
+    return is_velocity_silent(context) or (resumed_ns is not None and context.at_ns - resumed_ns < COMPARED_NS)
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
