@@ -470,25 +470,30 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
 
     Else it is the predicted one. Where both point against each other, one of them is wrong, and would accelerate the
     vehicle: then it is the one that recent positions show, or their mean where inertial data carry the prediction on.
+    One that recent positions show is as good as the own one where that points the same way, though it is doubted.
     Where only setpoints do, and the own velocity was right until a moment ago, it is that velocity and what setpoints
     and the lasting bias have changed since: it is newer than the last position.
     """
     estimate, plant, monitors = supervised.view.estimate, context.controller.plant, supervised.monitors.engaged
     predicted, belief = read_velocity(estimate, plant), supervised.view.belief
-    observation = observe_velocity(monitors, estimate, context)
-    if observation is not None and observation.own_mps is not None and judge_vehicle_velocity(observation).is_none:
-        own = _select_known(observation.own_mps, plant)
-        # v_own' v_predicted < 0
-        is_confirmed = monitors.velocity_change.confirms_velocity(context.at_ns)
-        if not is_confirmed and sum(map(operator.mul, own, predicted)) < 0.0:
-            if not are_positions_lost(belief, context.at_ns):
-                own = predicted
-            elif _is_inertial_new(belief):
-                own = _select_known([0.5 * (v + known) for v, known in zip(own, predicted, strict=True)], plant)
-        return own, True
     change, bias = monitors.velocity_change, find_lasting_bias(biases)
+    observation, are_lost = observe_velocity(monitors, estimate, context), are_positions_lost(belief, context.at_ns)
+    if observation is not None and observation.own_mps is not None:
+        own = _select_known(observation.own_mps, plant)
+        # v_own' v_predicted
+        along = sum(map(operator.mul, own, predicted))
+        if judge_vehicle_velocity(observation).is_none:
+            if along >= 0.0 or change.confirms_velocity(context.at_ns):
+                return own, True
+            if not are_lost:
+                return predicted, True
+            is_mean = _is_inertial_new(belief)
+            mean = _select_known([0.5 * (v + known) for v, known in zip(own, predicted, strict=True)], plant)
+            return mean if is_mean else own, True
+        if along > 0.0 and not are_lost and change.velocity_wrong_ns is None:
+            return predicted, True
     right = change.right_beside_model_mps
-    if right is None or _is_inertial_new(belief) or not are_positions_lost(belief, context.at_ns):
+    if right is None or _is_inertial_new(belief) or not are_lost:
         return predicted, False
     wind_mps2 = plant.to_accel(np.array(bias)) if bias else ZERO
     s = (context.at_ns - (change.right_ns or context.at_ns)) * 1e-9
