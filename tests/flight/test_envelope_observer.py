@@ -521,6 +521,7 @@ def later(watching: MonitorState, by_ns: int) -> MonitorState:
         ("motion", "resumed_ns"),
         ("acceleration", "over_ns"),
         ("velocity", "apart_ns"),
+        ("braking", "paused_ns"),
     )
     times = {name: at(group, name) + by_ns for group, name in names if at(group, name) is not None}
     if watching.consistent_ns is not None:
@@ -530,15 +531,15 @@ def later(watching: MonitorState, by_ns: int) -> MonitorState:
     pairs = (("motion", "sent"), ("motion", "vehicle_path"), ("velocity", "offsets"), ("velocity", "places"))
     rows = {name: moved(at(group, name)) for group, name in pairs}
     change = watching.velocity_change
-    names_of_change = ("agreed_ns", "disagrees_ns", "velocity_wrong_ns", "inertial_wrong_ns", "right_ns")
+    names_of_change = (
+        *("agreed_ns", "confirmed_ns", "disagrees_ns", "velocity_wrong_ns", "inertial_wrong_ns", "right_ns"),
+    )
     change_times: dict[str, Any] = {
         name: getattr(change, name) + by_ns for name in names_of_change if getattr(change, name) is not None
     }
     if change.repeated is not None:
         change_times["repeated"] = (*change.repeated[:2], change.repeated[2] + by_ns)
-    change_later = structs.replace(
-        change, samples=tuple((one[0] + by_ns, *one[1:]) for one in change.samples), **change_times
-    )
+    change_later = structs.replace(change, samples=moved(change.samples), lone=moved(change.lone), **change_times)
     response, (inertial_ns, own) = watching.response, (watching.response.inertial_ns, watching.response.velocity)
     response_later = structs.replace(
         response,

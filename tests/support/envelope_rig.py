@@ -76,7 +76,8 @@ def changed(state: MonitorState, **known: Any) -> MonitorState:
         state = structs.replace(state, outside=OutsideState(known.pop("outside_ns")))
     if "braking" in known or "braking_resumed_ns" in known:
         began, resumed_ns = known.pop("braking", state.braking.began), known.pop("braking_resumed_ns", None)
-        state = structs.replace(state, braking=BrakingState(began, resumed_ns or state.braking.resumed_ns))
+        paused_ns = known.pop("paused_ns", state.braking.paused_ns)
+        state = structs.replace(state, braking=BrakingState(began, resumed_ns or state.braking.resumed_ns, paused_ns))
     return structs.replace(state, **known)
 
 

@@ -409,12 +409,13 @@ def _is_velocity_lost(phase: _Phase) -> bool:
 
 
 def are_positions_compared(context: TickContext, supervised: Supervised) -> bool:
-    """Whether positions have just come back after a silence, and are compared before anything is flown on them.
+    """Whether positions have come back after a silence, and are compared before anything is flown on them.
 
-    Without the vehicle's own velocity, if that has come before, there is nothing to compare them with yet.
+    They are for a while, until they agree with the vehicle's own velocity, and until that comes, if it has come before.
     """
-    resumed_ns = supervised.monitors.engaged.motion.resumed_ns
-    return is_velocity_silent(context) or (resumed_ns is not None and context.at_ns - resumed_ns < COMPARED_NS)
+    monitors = supervised.monitors.engaged
+    is_new = monitors.motion.resumed_ns is not None and context.at_ns - monitors.motion.resumed_ns < COMPARED_NS
+    return is_new or monitors.velocity.is_contradicted or is_velocity_silent(context)
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:

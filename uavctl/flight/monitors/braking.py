@@ -1,7 +1,7 @@
 """Monitor: does braking slow the vehicle down, by its own velocity?
 
 1. The speed is noted when braking begins: once the setpoint, which is slew-limited, points against the velocity. It is
-   noted again where positions come back after a silence.
+   noted again where positions come back after a silence, or after a second of holding.
 2. A second later the speed is more than 0.8 of it, and 0.3 m/s. Then: end the plans.
 
 False alarms (docs/soak.md): 0 of 200 missions.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 
 import msgspec
+from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import TickObservation
@@ -29,6 +30,7 @@ class BrakingState(msgspec.Struct, frozen=True):
 
     began: tuple[int, float] | None = None  # when braking began [ns], and the speed then [m/s]; None while it does not
     resumed_ns: int | None = None  # capture time of the first position after the last silence before that [ns]
+    paused_ns: int | None = None  # since when it has paused [ns]; None while it does not
 
 
 def update(
@@ -43,7 +45,12 @@ def update(
     if state.resumed_ns != motion.resumed_ns:  # positions that come back correct the vehicle's own velocity
         state = BrakingState(resumed_ns=motion.resumed_ns)
     if not tick.braking:
-        return (state if state.began is None else BrakingState(resumed_ns=state.resumed_ns)), NO_VERDICT
+        paused_ns = state.paused_ns or tick.at_ns
+        if state.began is None or tick.at_ns - paused_ns >= EFFECT_NS:
+            return BrakingState(resumed_ns=state.resumed_ns), NO_VERDICT
+        return replace(state, paused_ns=paused_ns), NO_VERDICT
+    if state.paused_ns is not None:
+        state = replace(state, paused_ns=None)
     if not believes_velocity:
         return BrakingState(resumed_ns=state.resumed_ns), NO_VERDICT
     velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
