@@ -13,7 +13,7 @@ from logs.recording.flight import FlightData
 from logs.recording.replay import replay
 from logs.recording.summary import summarise
 from uavctl.config import load_config
-from uavctl.records import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SetpointSource, SolveStatus, Truth
+from uavctl.records import Datagram, Decision, Plan, Setpoint, SetpointSource, SolveStatus, Truth
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.wiring.controller import build_design
 
@@ -68,34 +68,6 @@ def test_the_true_state_follows_the_plant_and_the_applied_inputs() -> None:
     for step, truth in enumerate(truths):
         # float32 on the wire
         assert decided[step] == pytest.approx(truth.input, rel=1e-6, abs=1e-6)
-
-
-def test_blackout_from_step_20_falls_back_in_the_tick_in_which_age_reaches_the_horizon() -> None:
-    memory = lockstep("paper", 40.0, "link.blackout=[[20.0, 100.0]]")
-    decisions = memory.of(Decision)
-    horizon = load_config("paper").smpc.horizon
-    fallen = next(d for d in decisions if d.mode not in (ControlMode.WAIT, ControlMode.TRACK))
-    assert fallen.boundary
-    assert fallen.age_steps == horizon
-    before = [d for d in decisions if d.tick < fallen.tick and d.age_steps is not None]
-    assert all(d.age_steps < horizon and d.mode is ControlMode.TRACK for d in before if d.age_steps is not None)
-    newest = max(e.captured_ns for e in memory.of(Estimate))
-    assert fallen.at_ns == newest + horizon * 1_000_000_000
-
-
-def test_playout_flies_the_old_plan_s_next_input_in_every_step_of_silence() -> None:
-    memory = lockstep("paper", 60.0)
-    plans = {plan.seq: plan for plan in memory.of(Plan)}
-    silent = 0
-    for decision in memory.of(Decision):
-        if not decision.boundary or decision.mode is not ControlMode.TRACK:
-            continue
-        assert decision.plan_seq is not None and decision.plan_index is not None and decision.input is not None
-        assert decision.plan_index == decision.age_steps
-        planned = plans[decision.plan_seq].inputs[decision.plan_index]
-        assert decision.input == pytest.approx(planned, abs=1e-12)
-        silent += decision.plan_index > 0
-    assert silent > 5
 
 
 @pytest.mark.slow
