@@ -494,7 +494,8 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
         if along > 0.0 and not are_lost and change.velocity_wrong_ns is None:
             return predicted, True
     right = change.right_beside_model_mps
-    if right is None or _is_inertial_new(belief) or not are_lost:
+    is_carried = _is_inertial_new(belief) and not change.repeats(context.at_ns)
+    if right is None or is_carried or not are_lost:
         return predicted, False
     wind_mps2 = plant.to_accel(np.array(bias)) if bias else ZERO
     s = (context.at_ns - (change.right_ns or context.at_ns)) * 1e-9

@@ -48,7 +48,7 @@ BOOTING_NS = 3_000_000_000  # silence before a heartbeat of booting that shows a
 MAX_ATTITUDE_AGE_NS = 100_000_000  # at 1 rad/s the attitude is then 0.1 rad off, and the acceleration 1 m/s²
 GRAVITY_MPS2 = 9.80665
 MAX_DELAY_NS = 60_000_000  # later than the quickest message: a stream of 50 Hz has 20 ms between messages
-MAX_VELOCITY_DELAY_NS = 600_000_000  # a velocity that is later says nothing of now; one of 0.3 s still helps
+MAX_VELOCITY_DELAY_NS = 1_000_000_000  # a velocity that is later says nothing of now; one of 0.7 s still helps
 MAX_BACKSTEP_US = 1_000_000  # a stamp that goes back by more is of another clock
 _UNREPORTED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 # PX4 is in standby only while its pre-flight checks pass, else uninitialised. That changes without a restart.

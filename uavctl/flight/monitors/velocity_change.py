@@ -8,7 +8,8 @@
    the setpoints; both are, if both are further than gusts explain. Where Δv is known to be wrong, only Δi is compared.
 4. An own velocity that repeats to the last bit while Δm grows is wrong, too. So is one that leaps from one message to
    the next by more than Δm and gusts explain. Once inertial data are known to be wrong, half as much is a proof.
-5. Where the own velocity has stopped, Δi that is further from Δm than gusts explain is wrong.
+5. Where the own velocity has stopped, or has repeated for a second, Δi that is further from Δm than gusts explain is
+   wrong.
 
 A wrong velocity is not braked on, and wrong inertial data do not carry the estimate on. The own velocity that was right
 before is kept: with Δm it is the best that is known without a position. Where no position comes, the vehicle brakes
@@ -99,6 +100,11 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     state = _believe_again(state, tick.at_ns, velocity, parameters)
     own = read_vehicle_velocity(tick.motion, tick.at_ns)
     own_ns = None if tick.motion is None else tick.motion.velocity_ns
+    repeated = state.repeated if state.repeats(tick.at_ns) else None
+    if repeated is not None and own_ns is not None and own == repeated[0]:
+        # It is as good as none.
+        state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
+        own = None
     is_corrected = motion.resumed_ns is not None and tick.at_ns < motion.resumed_ns + CORRECTS_NS
     unexplained = (0.0, 0.0, 0.0) if motion.observer is None else tuple(motion.observer.mean[2].tolist())
     if is_corrected and state.disagrees_ns is not None and state.samples:
@@ -111,7 +117,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     if motion.inertial_path and tick.inertial_mps2 is not None:
         gained = tuple(motion.inertial_path[-1].integrate(tick.at_ns if own is None else own_ns or tick.at_ns)[0])
     if own is None or own_ns is None or is_corrected:
-        state = replace(state, samples=(), disagrees_ns=None, repeated=None)
+        state = replace(state, samples=(), disagrees_ns=None, repeated=repeated if own is None else None)
         if own is not None or gained is None or is_corrected:
             return state
         return _judge_lone_inertial(state, (tick.at_ns, gained, motion.model_mps), unexplained, parameters)
