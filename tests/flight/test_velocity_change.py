@@ -319,9 +319,11 @@ def test_changes_agree_up_to_a_bound_that_grows_with_time(ns: int, bound_mps: fl
     assert (beyond.agreed_ns, beyond.disagrees_ns) == (None, START_NS + ns)
 
 
-@pytest.mark.parametrize(("model_mps", "agrees"), [(0.1, True), (0.09, False)])
+@pytest.mark.parametrize(("model_mps", "agrees"), [(0.09376, True), (0.09375, False)])
 def test_inertial_data_three_times_as_near_to_setpoints_do_not_drift(model_mps: float, agrees: bool) -> None:
-    own_mps = 0.39  # less than 0.25 m/s and half a second of drift; |Δv - Δm| = 0.29 < 3 |Δi - Δm|, or 0.30
+    own_mps = (
+        0.375  # less than 0.25 m/s and half a second of drift; |Δv - Δm| = 3 |Δi - Δm| where the model has 0.09375
+    )
     state = compare(north(own_mps), ZERO, model=north(model_mps))
     assert (state.agreed_ns is not None) == agrees == (state.disagrees_ns is None)
     # So far apart that nothing but the drift explains it.
@@ -447,6 +449,8 @@ def test_where_the_own_velocity_has_stopped_setpoints_check_inertial_data(sign: 
     off_mps = sign * LONE_MPS
     assert is_found(fall_silent(north(1.0 + off_mps * (1.0 - 1e-9)))) == (False, False)
     assert is_found(fall_silent(north(1.0 + off_mps * (1.0 + 1e-9)))) == (False, True)
+    at_bound = fall_silent(north(off_mps), lone=((START_NS, ZERO, north(2.0)),))
+    assert is_found(at_bound) == (False, False)
     # The acceleration that positions showed may last, or not.
     for gained_mps in (0.0, sign * 2.0):
         assert is_found(fall_silent(north(1.0 + gained_mps), pushed_mps2=north(sign * 4.0))) == (False, False)
@@ -469,13 +473,35 @@ def test_lone_inertial_data_are_compared_over_a_second() -> None:
 
 
 def test_the_last_own_velocity_is_remembered_once_it_stops_and_forgotten_once_it_comes() -> None:
-    sample = (START_NS, north(1.5), ZERO, north(0.5))
-    state = fall_silent(north(1.0), samples=(sample,), right_ns=None)
+    before, sample = (START_NS - 50 * MS, north(9.0), ZERO, ZERO), (START_NS, north(1.5), ZERO, north(0.5))
+    state = fall_silent(north(1.0), samples=(before, sample), right_ns=None)
     assert (state.right_beside_model_mps, state.right_ns) == (north(1.0), START_NS)
     again = fall_silent(north(1.0), own=north(1.0), right_beside_model_mps=north(1.0))
     assert (again.right_beside_model_mps, again.right_ns) == (None, None)
     wrong = fall_silent(north(1.0), samples=(sample,), velocity_wrong_ns=START_NS, right_beside_model_mps=north(3.0))
     assert wrong.right_beside_model_mps == north(3.0)
+
+
+def test_inertial_data_count_up_to_the_own_velocity_or_up_to_now_without_one() -> None:
+    at_ns, own_ns = START_NS + HALF_S_NS, START_NS + HALF_S_NS - 100 * MS
+    moved = Motion(tick_ns=at_ns, inertial_path=(InertialSpan(START_NS, north(10.0), ZERO, ZERO),))
+    for own, gained_mps in ((motion(north(0.1), own_ns), 4.0), (None, 5.0)):
+        tick = structs.replace(seen(at_ns, vehicle_motion=own), inertial_mps2=ZERO)
+        state = update(INITIAL, TickObservation(tick, moved, PARAMETERS), NO_POSITIONS)
+        gained = state.lone[-1][1] if own is None else state.samples[-1][2]
+        assert gained == pytest.approx(north(gained_mps))
+
+
+@pytest.mark.fault(94)
+def test_an_own_velocity_that_has_repeated_for_a_second_is_as_good_as_none() -> None:
+    own, since_ns = north(1.0), START_NS + HALF_S_NS - 1_000_000_001
+    lie = north(1.0 + 1.01 * LONE_MPS)
+    state = fall_silent(lie, own=own, repeated=(own, north(2.0), since_ns))
+    assert is_found(state) == (False, True) and state.repeated == (own, north(2.0), since_ns)
+    # That setpoints have changed by more than a disagreement since shows that it is wrong.
+    assert is_found(fall_silent(north(1.0), own=own, repeated=(own, north(1.7), since_ns))) == (True, False)
+    for other in ((own, north(2.0), since_ns + 1), (north(1.1), north(2.0), since_ns)):
+        assert is_found(fall_silent(lie, own=own, repeated=other)) == (False, False)
 
 
 def test_changes_are_compared_whatever_the_velocities_were_at_first() -> None:

@@ -115,7 +115,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
         state = _remember_right(state, is_silent=own is None)
     gained: Vector | None = None
     if motion.inertial_path and tick.inertial_mps2 is not None:
-        gained = tuple(motion.inertial_path[-1].integrate(tick.at_ns if own is None else own_ns or tick.at_ns)[0])
+        gained = tuple(motion.inertial_path[-1].integrate(tick.at_ns if own is None or own_ns is None else own_ns)[0])
     if own is None or own_ns is None or is_corrected:
         state = replace(state, samples=(), disagrees_ns=None, repeated=repeated if own is None else None)
         if own is not None or gained is None or is_corrected:
