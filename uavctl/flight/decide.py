@@ -481,16 +481,16 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
     observation, are_lost = observe_velocity(monitors, estimate, context), are_positions_lost(belief, context.at_ns)
     if observation is not None and observation.own_mps is not None:
         own = _select_known(observation.own_mps, plant)
-        # v_own' v_predicted
+        # It points against the other where v_own' v_predicted < 0
         along = sum(map(operator.mul, own, predicted))
         if judge_vehicle_velocity(observation).is_none:
             if along >= 0.0 or change.confirms_velocity(context.at_ns):
                 return own, True
             if not are_lost:
                 return predicted, True
-            is_mean = _is_inertial_new(belief)
-            mean = _select_known([0.5 * (v + known) for v, known in zip(own, predicted, strict=True)], plant)
-            return mean if is_mean else own, True
+            if not _is_inertial_new(belief):
+                return own, True
+            return _select_known([0.5 * (v + known) for v, known in zip(own, predicted, strict=True)], plant), True
         if along > 0.0 and not are_lost and change.velocity_wrong_ns is None:
             return predicted, True
     right = change.right_beside_model_mps
