@@ -1,7 +1,7 @@
 """Monitor: does braking slow the vehicle down, by its own velocity?
 
 1. The speed is noted when braking begins: once the setpoint, which is slew-limited, points against the velocity. It is
-   noted again where positions come back after a silence, or after a second of holding.
+   noted again where positions come back after a silence, or after a longer hold or a plan.
 2. A second later the speed is more than 0.8 of it, and 0.3 m/s. Then: end the plans.
 
 False alarms (docs/soak.md): 0 of 200 missions.
@@ -21,6 +21,7 @@ from uavctl.flight.monitors.outside import describe_overrun
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 
 EFFECT_NS = 1_000_000_000  # time after which braking must have reduced the speed
+PAUSE_NS = 200_000_000  # a shorter hold does not begin braking anew: no plan flies in between
 # It must be below this part of the first speed, plus this.
 MAX_SPEED_PART, MAX_SPEED_MPS = 0.8, 0.3
 
@@ -46,7 +47,7 @@ def update(
         state = BrakingState(resumed_ns=motion.resumed_ns)
     if not tick.braking:
         paused_ns = state.paused_ns or tick.at_ns
-        if state.began is None or tick.at_ns - paused_ns >= EFFECT_NS:
+        if state.began is None or tick.at_ns - paused_ns >= PAUSE_NS:
             return BrakingState(resumed_ns=state.resumed_ns), NO_VERDICT
         return replace(state, paused_ns=paused_ns), NO_VERDICT
     if state.paused_ns is not None:
