@@ -102,7 +102,7 @@ def update(state: VelocityChangeState, observation: TickObservation, velocity: V
     own_ns = None if tick.motion is None else tick.motion.velocity_ns
     repeated = state.repeated if state.repeats(tick.at_ns) else None
     if repeated is not None and own_ns is not None and own == repeated[0]:
-        # It is as good as none.
+        # A velocity that repeats is as good as none.
         state = _judge_alone(state, (own, motion.model_mps, own_ns), tick.at_ns, parameters)
         own = None
     is_corrected = motion.resumed_ns is not None and tick.at_ns < motion.resumed_ns + CORRECTS_NS
