@@ -485,10 +485,11 @@ def test_the_last_own_velocity_is_remembered_once_it_stops_and_forgotten_once_it
 def test_inertial_data_count_up_to_the_own_velocity_or_up_to_now_without_one() -> None:
     at_ns, own_ns = START_NS + HALF_S_NS, START_NS + HALF_S_NS - 100 * MS
     moved = Motion(tick_ns=at_ns, inertial_path=(InertialSpan(START_NS, north(10.0), ZERO, ZERO),))
-    for own, gained_mps in ((motion(north(0.1), own_ns), 4.0), (None, 5.0)):
+    old = motion(north(0.1), at_ns - 301 * MS)
+    for own, gained_mps in ((motion(north(0.1), own_ns), 4.0), (None, 5.0), (old, 5.0)):
         tick = structs.replace(seen(at_ns, vehicle_motion=own), inertial_mps2=ZERO)
         state = update(INITIAL, TickObservation(tick, moved, PARAMETERS), NO_POSITIONS)
-        gained = state.lone[-1][1] if own is None else state.samples[-1][2]
+        gained = state.samples[-1][2] if state.samples else state.lone[-1][1]
         assert gained == pytest.approx(north(gained_mps))
 
 
