@@ -141,8 +141,8 @@ def test_garbage_in_a_time_since_boot_is_no_restart() -> None:
 )
 def test_disorder_the_wrap_and_gaps_are_no_restarts(before_ms: int, after_ms: int) -> None:
     link, vehicle = heard(before_ms)
-    told = events(link.receive(vehicle.local_position(after_ms), NOW + SECOND).items)
-    assert EventCode.VEHICLE_REBOOT not in [event.code for event in told]
+    reported = events(link.receive(vehicle.local_position(after_ms), NOW + SECOND).items)
+    assert EventCode.VEHICLE_REBOOT not in [event.code for event in reported]
     assert newest(link, vehicle).boots == 0
 
 

@@ -36,13 +36,14 @@ from uavctl.flight.fallback import (
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_led, is_over, lead_with_one_axis, make_question
+from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.risk import set_risk
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
-from uavctl.flight.supervise import Supervised, are_positions_lost, is_velocity_silent, observe_velocity
+from uavctl.flight.supervise import Supervised, are_positions_lost, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.plant import Plant
@@ -225,9 +226,13 @@ def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
         return _fall_back(draft, draft.fallback or begin_fallback(at_ns), phase, reason)
     wanted = controller.fallback.recover_samples
     if draft.fallback is not None and are_positions_compared(phase.context, phase.supervised):
-        reason = "positions have come back, and their first second is compared"
+        is_silent = _is_velocity_silent(phase.context)
+        with_what = (
+            "but the vehicle's velocity has not" if is_silent else "and are compared with the vehicle's velocity"
+        )
+        reason = f"positions have come back, {with_what}"
         # Without the own velocity, the time to hold runs on.
-        is_fresh = draft.consecutive_samples >= wanted and not is_velocity_silent(phase.context)
+        is_fresh = draft.consecutive_samples >= wanted and not is_silent
         fallback = restart_hold(draft.fallback, at_ns) if is_fresh else draft.fallback
         return _fall_back(draft, fallback, phase, reason)
     if draft.fallback is not None and draft.consecutive_samples < wanted:
@@ -415,7 +420,14 @@ def are_positions_compared(context: TickContext, supervised: Supervised) -> bool
     """
     monitors = supervised.monitors.engaged
     is_new = monitors.motion.resumed_ns is not None and context.at_ns - monitors.motion.resumed_ns < COMPARED_NS
-    return is_new or monitors.velocity.is_contradicted or is_velocity_silent(context)
+    return is_new or monitors.velocity.is_contradicted or _is_velocity_silent(context)
+
+
+def _is_velocity_silent(context: TickContext) -> bool:
+    """Whether the vehicle's own velocity has come, and does not any more."""
+    motion = context.inputs.motion
+    has_come = motion is not None and motion.velocity_ns is not None
+    return has_come and read_vehicle_velocity(motion, context.at_ns) is None
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
@@ -472,8 +484,8 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
     Else it is the predicted one. Where both point against each other, one of them is wrong, and would accelerate the
     vehicle: then it is the one that recent positions show, or their mean where inertial data carry the prediction on.
     One that recent positions show is as good as the own one where that points the same way, though it is doubted.
-    Where only setpoints do, and the own velocity was right until a moment ago, it is that velocity and what setpoints
-    and the lasting bias have changed since: it is newer than the last position.
+    Where only setpoints do, or the own velocity repeats, it is the last own one that was right, and what setpoints and
+    the lasting bias have changed since: it is newer than the last position.
     """
     estimate, plant, monitors = supervised.view.estimate, context.controller.plant, supervised.monitors.engaged
     predicted, belief = read_velocity(estimate, plant), supervised.view.belief

@@ -209,9 +209,6 @@ def _judge_estimate(
         compares = returned_ns >= CORRECTS_NS
         if is_new or (is_recent and (has_drifted or (compares and _is_apart(state, belief, view, context)))):
             return _POSITIONS_CONTRADICTED, NO_VERDICT
-    is_alone = inertial.contradict_model_alone(belief.inertial) and is_velocity_silent(context)
-    if is_alone and are_positions_lost(belief, context.at_ns):
-        return NO_VERDICT, inertial.distrust(belief.inertial, context.at_ns)[1]
     consistent = change.inertial_wrong_ns is None and not has_drifted
     comparison = InertialObservation(ComparedSource.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
     return NO_VERDICT, inertial.update(belief.inertial, comparison)[1]
@@ -367,13 +364,6 @@ def _are_supported(change: VelocityChangeState, at_ns: int) -> bool:
     """Whether the vehicle's own velocity changes as its inertial data do: what the model does not explain is wind."""
     has_both = bool(change.samples) and change.samples[-1][2] is not None
     return has_both and not change.contradicts and change.supports_velocity(at_ns)
-
-
-def is_velocity_silent(context: TickContext) -> bool:
-    """Whether the vehicle's own velocity has come, and does not any more."""
-    motion = context.inputs.motion
-    has_come = motion is not None and motion.velocity_ns is not None
-    return has_come and read_vehicle_velocity(motion, context.at_ns) is None
 
 
 def _is_near_limit(view: FilterView, context: TickContext) -> bool:

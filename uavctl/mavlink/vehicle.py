@@ -113,7 +113,7 @@ class SensorStreamMonitor:
         return delay_ns <= MAX_DELAY_NS and not (is_repeated and stamp_us - self._since_us >= frozen_us)
 
     def measure_delay_ns(self, stamp_us: int, at_ns: int) -> int:
-        """Return the delay of a message behind the quickest one [ns]; a stamp of another clock starts anew."""
+        """Return the delay of a message behind the quickest one [ns]; a stamp of another clock begins a new one."""
         advance_us = stamp_us - self._stamp_us
         if advance_us < -MAX_BACKSTEP_US or advance_us > (at_ns - self._checked_ns) // 1000 + MAX_BACKSTEP_US:
             self._clock, self._since_us = ArrivalClock(), stamp_us

@@ -21,7 +21,7 @@ from uavctl.flight.monitors.outside import describe_overrun
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, end_plans
 
 EFFECT_NS = 1_000_000_000  # time after which braking must have reduced the speed
-PAUSE_NS = 200_000_000  # a shorter hold does not begin braking anew: no plan flies in between
+PAUSE_NS = 200_000_000  # after a shorter hold braking goes on: no plan has flown
 # It must be below this part of the first speed, plus this.
 MAX_SPEED_PART, MAX_SPEED_MPS = 0.8, 0.3
 

@@ -69,11 +69,11 @@ def update(trust: InertialTrust, observation: InertialObservation) -> tuple[Iner
         if observation.is_consistent:
             return InertialTrust(used_ns=at_ns), NO_VERDICT
         trust = replace(trust, refused=trust.refused + 1)
-        return distrust(trust, at_ns) if trust.refused >= MOST_REFUSED else (trust, NO_VERDICT)
+        return _distrust(trust, at_ns) if trust.refused >= MOST_REFUSED else (trust, NO_VERDICT)
     carried_on = trust.used_ns is not None and trust.used_ns > observation.captured_ns
     if observation.is_consistent or not carried_on:
         return trust, NO_VERDICT
-    return distrust(trust, at_ns)
+    return _distrust(trust, at_ns)
 
 
 def _update_distrusted(trust: InertialTrust, since_ns: int, observation: InertialObservation) -> InertialTrust:
@@ -90,8 +90,7 @@ def contradict_model_alone(trust: InertialTrust) -> bool:
     return trust.distrusted_ns is not None and trust.refused >= MOST_REFUSED
 
 
-def distrust(trust: InertialTrust, at_ns: int) -> tuple[InertialTrust, Verdict]:
-    """Distrust inertial data from now on."""
+def _distrust(trust: InertialTrust, at_ns: int) -> tuple[InertialTrust, Verdict]:
     verdict = Verdict(Action.DISTRUST_INERTIAL, EventCode.INERTIAL_DOUBTED, since_ns=at_ns)
     return replace(trust, distrusted_ns=at_ns), verdict
 
