@@ -549,30 +549,6 @@ def test_nothing_leads_back_while_positions_that_came_back_are_compared() -> Non
     assert len(held_mps2) > 5 and max(held_mps2) < 0.4
 
 
-@pytest.mark.fault(94)
-@pytest.mark.parametrize("heard_s", [4.5, 9.0])
-def test_plans_fly_again_once_the_own_velocity_has_come_again_or_it_lands(heard_s: float) -> None:
-    controller, state, modes = controller_that_feels(), make_initial_state(), {}
-    controller = replace(controller, envelope=replace(PARAMETERS, axes=(True, False, False)))
-    moved = None
-    for tick in range(9 * 20):
-        at_ns, s = START_NS + tick * TICK_NS, tick * TICK_NS * 1e-9
-        noise = 0.001 * (tick % 7)
-        moved = moved if 1.0 < s <= heard_s else motion((noise, 0.0, 0.0), at_ns)
-        given = StepInput(
-            tick=tick,
-            at_ns=at_ns,
-            samples=() if 1.0 < s <= 4.0 else (sample(at_ns, position_m=(noise, 0.0, 0.0)),),
-            vehicle=vehicle(),
-            motion=moved,
-            inertial=felt_at(at_ns - MS, noise),
-        )
-        state, one = run_tick(state, given, controller)
-        modes[s] = one.decision.mode
-    flown_again = any(mode == "track" for s, mode in modes.items() if s > 4.0)
-    assert flown_again == (heard_s < 9.0) == ("land" not in modes.values())
-
-
 def blow(*, moves: bool = True, has_velocity: bool = True, left_m: float = 9.0) -> list[TickOutput]:
     """Ticks of a vehicle on which a wind of 1 m/s² sets in after 2 s, or whose inertial data say so, and positions end.
 

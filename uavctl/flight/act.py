@@ -109,7 +109,7 @@ def _compute_fallback_accel(fallback: Fallback, context: TickContext, supervised
     moving, _ = find_braking_velocity(fallback, decided.biases, context, supervised)
     brake = compute_brake_accel(fallback, context.at_ns, moving, context.controller.fallback)
     hold = find_hold_accel(fallback, decided.biases, context, supervised)
-    # Positions that have come back may be wrong, and so may inertial data that no own velocity checks.
+    # Positions that have come back may be wrong: nothing leads back while they are compared.
     point_m = None if are_positions_compared(context, supervised) else decided.hold_point_m
     back = find_return_accel(fallback, point_m, supervised.view, context.controller.plant)
     # a = a_brake + a_hold + a_return

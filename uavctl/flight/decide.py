@@ -36,7 +36,6 @@ from uavctl.flight.fallback import (
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_led, is_over, lead_with_one_axis, make_question
-from uavctl.flight.monitors.observation import read_vehicle_velocity
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
@@ -226,13 +225,8 @@ def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
         return _fall_back(draft, draft.fallback or begin_fallback(at_ns), phase, reason)
     wanted = controller.fallback.recover_samples
     if draft.fallback is not None and are_positions_compared(phase.context, phase.supervised):
-        is_silent = _is_velocity_silent(phase.context)
-        with_what = (
-            "but the vehicle's velocity has not" if is_silent else "and are compared with the vehicle's velocity"
-        )
-        reason = f"positions have come back, {with_what}"
-        # Without the own velocity, the time to hold runs on.
-        is_fresh = draft.consecutive_samples >= wanted and not is_silent
+        reason = "positions have come back, and are compared with the vehicle's velocity"
+        is_fresh = draft.consecutive_samples >= wanted
         fallback = restart_hold(draft.fallback, at_ns) if is_fresh else draft.fallback
         return _fall_back(draft, fallback, phase, reason)
     if draft.fallback is not None and draft.consecutive_samples < wanted:
@@ -416,18 +410,11 @@ def _is_velocity_lost(phase: _Phase) -> bool:
 def are_positions_compared(context: TickContext, supervised: Supervised) -> bool:
     """Whether positions have come back after a silence, and are compared before anything is flown on them.
 
-    They are for a while, until they agree with the vehicle's own velocity, and until that comes, if it has come before.
+    They are for a while, and until they agree with the vehicle's own velocity.
     """
     monitors = supervised.monitors.engaged
     is_new = monitors.motion.resumed_ns is not None and context.at_ns - monitors.motion.resumed_ns < COMPARED_NS
-    return is_new or monitors.velocity.is_contradicted or _is_velocity_silent(context)
-
-
-def _is_velocity_silent(context: TickContext) -> bool:
-    """Whether the vehicle's own velocity has come, and does not any more."""
-    motion = context.inputs.motion
-    has_come = motion is not None and motion.velocity_ns is not None
-    return has_come and read_vehicle_velocity(motion, context.at_ns) is None
+    return is_new or monitors.velocity.is_contradicted
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:

@@ -208,7 +208,10 @@ class VehicleMonitor:
                 return self._update_evidence(at_ns)
             case Position(boot_ms=True, stamp_us=int(stamp_us)):
                 status = self._update_boot_clock("position", stamp_us, at_ns)
-                if self._find_stream("velocity").measure_delay_ns(stamp_us, at_ns) > MAX_VELOCITY_DELAY_NS and stamp_us:
+                delay_ns = self._find_stream("velocity").measure_delay_ns(stamp_us, at_ns)
+                # One that repeats is passed on: that it repeats is found, and counts (`uavctl.flight.monitors`).
+                is_new = message.velocity_mps != self._motion.velocity_mps
+                if stamp_us and is_new and delay_ns > MAX_VELOCITY_DELAY_NS:
                     self._count_bad(EventCode.VELOCITY_STALE)
                     return status
                 return (*status, *self._update_motion(at_ns, velocity=message.velocity_mps))
