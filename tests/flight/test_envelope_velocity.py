@@ -144,11 +144,15 @@ def test_a_velocity_that_is_contradicted_is_not_agreed_with() -> None:
         assert VelocityState(apart_mps=apart_mps).agrees(PARAMETERS) == agrees
 
 
-def test_a_contradiction_counts_from_a_window_after_the_first_second_of_positions_on() -> None:
-    since_ns = AT_NS - PARAMETERS.window_ns - SECOND_NS
-    for resumed_ns, counts in ((since_ns, True), (since_ns + 1, False)):
-        watching, _ = look(ZERO, vehicle_motion=AT_REST, resumed_ns=resumed_ns, **offsets(0.3))
-        assert watching.velocity.is_contradicted and (watching.velocity.apart_ns is not None) == counts
+def test_a_contradiction_counts_by_offsets_after_the_first_second_of_positions_alone() -> None:
+    known = offsets(0.3)
+    times_ns = [at_ns for at_ns, _ in known["offsets"]]
+    # The first offset is the first that counts; or it does not, and too few are left; or all are in that second.
+    for resumed_ns, finds in ((times_ns[0], True), (times_ns[0] + 1, False)):
+        watching, _ = look(ZERO, vehicle_motion=AT_REST, resumed_ns=resumed_ns - SECOND_NS, **known)
+        assert watching.velocity.is_contradicted and (watching.velocity.apart_ns is not None) == finds
+    watching, _ = look(ZERO, vehicle_motion=AT_REST, resumed_ns=AT_NS - SECOND_NS + 1, **known)
+    assert watching.velocity.is_contradicted and watching.velocity.apart_ns is None
 
 
 @pytest.mark.parametrize("known", [("offsets",), ("places",), ("offsets", "places")])
@@ -487,7 +491,7 @@ def test_an_own_velocity_that_inertial_data_support_is_believed_against_position
     ours = structs.replace(seen(AT_NS, vehicle_motion=motion((0.5, 0.0, 0.0), AT_NS)), velocity_mps=ZERO)
     watching = structs.replace(
         monitors(is_contradicted=True),
-        velocity_change=VelocityChangeState(agreed_ns=agreed_ns, velocity_wrong_ns=wrong_ns),
+        velocity_change=VelocityChangeState(agreed_ns=agreed_ns, supported_ns=agreed_ns, velocity_wrong_ns=wrong_ns),
     )
     assert trusted_velocity(watching, ours, 0.0, PARAMETERS) == ((0.5, 0.0, 0.0) if believed else None)
 
@@ -520,7 +524,8 @@ def test_the_first_second_of_positions_after_a_silence_corrects_the_vehicle_s_ow
             found_ms.append(now_ms - back_ms)
     assert bool(found_ms) == found
     if found:
-        late_ms = 2200 if silence_ms > 1000 else 0  # the window of comparison, 1.2 s, begins after that second
+        # Offsets over 0.36 s, three tenths of the window of comparison, begin after that second.
+        late_ms = 1360 if silence_ms > 1000 else 0
         assert late_ms <= found_ms[0] <= late_ms + 1000
 
 
@@ -542,7 +547,7 @@ def find_return(
     *,
     resumed_ns: int | None,
     disagreement_mps: float = 0.25,
-) -> tuple[float, list[float]] | None:
+) -> tuple[float, list[float], float] | None:
     """The position `now_m` comes after a silence: its offset is that from the vehicle's own way."""
     distance = find_distance(path, at_ns)
     observer = Observer(at_ns, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
@@ -574,11 +579,9 @@ def test_a_vehicle_that_accelerates_through_a_silence_comes_back_on_its_own_way(
     then, now = 2, 14
     before = ((START_NS + then * step_ns, vec3(np.subtract(fly(times_s[then]), flown[then]))),)
     at_ns, end = START_NS + now * step_ns, fly(times_s[now])
-    assert find_return(before, end, path, at_ns, resumed_ns=at_ns, disagreement_mps=1e-9) is None
-    found = find_return(
-        before, vec3(end + np.array([0.1, 0.2, -0.3])), path, at_ns, resumed_ns=at_ns, disagreement_mps=1e-9
-    )
-    assert found is not None and found[0] == pytest.approx(3.0) and found[1] == pytest.approx([0.1, 0.2, -0.3])
+    for off_m in (ZERO, (0.1, 0.2, -0.3)):
+        found = find_return(before, vec3(end + np.array(off_m)), path, at_ns, resumed_ns=at_ns)
+        assert found is not None and found[0] == pytest.approx(3.0) and found[1] == pytest.approx(off_m)
     for resumed_ns in (None, at_ns - 1):  # it is not the first position
         assert find_return(before, (9.0, 9.0, 9.0), path, at_ns, resumed_ns=resumed_ns) is None
     assert find_return((), (9.0, 9.0, 9.0), path, at_ns, resumed_ns=at_ns) is None
@@ -590,9 +593,37 @@ def test_positions_come_back_just_so_far_beside_the_way() -> None:
     path = ((START_NS, ZERO), (START_NS + 500 * MS, ZERO), (START_NS + 2500 * MS, ZERO))
     at_ns, before = START_NS + 2000 * MS, ((START_NS, ZERO),)
     bound_m = (0.8 + 0.12 * 2.0 * 2.0) * 0.25
-    for off_m, ends in ((bound_m, False), (just_more(bound_m), True)):
-        found = find_return(before, (0.0, -off_m, 0.0), path, at_ns, resumed_ns=at_ns)
-        assert (found is not None) == ends
+    found = find_return(before, (0.0, -bound_m, 0.0), path, at_ns, resumed_ns=at_ns)
+    assert found == (2.0, [0.0, -bound_m, 0.0], bound_m)
+
+
+@pytest.mark.fault(95)
+@pytest.mark.parametrize(
+    ("place_m", "allowed_m", "bound_m"),
+    [
+        ((0.0, 0.0, -2.0), 0.68, 0.68),
+        ((2.6, 0.0, -2.0), 0.68, 0.8 * 0.68),  # the own way leads to the wall
+        ((0.0, 0.0, -2.0), 0.2, 0.5),  # as a drift without a silence
+        ((2.6, 0.0, -2.0), 0.2, 0.25),
+    ],
+)
+@pytest.mark.parametrize("back_m", [0.2, 0.0, -0.2])
+def test_what_positions_came_back_with_and_have_moved_since_is_bounded_in_all(
+    place_m: Vec3, allowed_m: float, bound_m: float, back_m: float
+) -> None:
+    """They came back south of the own way, and have moved further south; in 5 s, 0.2 m more are allowed."""
+    since_ns = AT_NS - 5 * SECOND_NS
+    places, returned = ((since_ns, (7.0, 0.0, 0.0), ZERO),), ([-back_m, 0.0, 0.0], allowed_m)
+    for beyond_m, is_found in ((-1e-9, False), (1e-9, True)):
+        now = [7.0 - (bound_m + 0.16 * 5.0 * PARAMETERS.disagreement_mps + beyond_m - back_m), 0.0, 0.0]
+        # Places from before the return hold what it has shown.
+        for resumed_ns in (since_ns, since_ns + 1):
+            observation = structs.replace(believed(place_m), motion=Motion(resumed_ns=resumed_ns))
+            state = VelocityState(places=places, returned=returned)
+            found = velocity._find_away(state, now, [places[0][1]], places, observation)
+            assert (found is not None) == (is_found and resumed_ns == since_ns)
+    assert velocity._find_away(VelocityState(), now, [places[0][1]], places, observation) is None
+    assert velocity._find_away(VelocityState(returned=returned), now, [], (), observation) is None
 
 
 @pytest.mark.parametrize(("late_s", "found_s"), [(0.2, 0.2), (0.0, 0.0), (-0.1, 0.0), (0.5, 0.3)])

@@ -8,7 +8,8 @@
    the plans. The bound begins with half as much where the vehicle's own way leads it to a wall or the ceiling:
    positions that stay where they were would let a slow drift carry it out.
 4. Velocities contradicted each other, and then no position came for 0.6 s. Then: end the plans.
-5. The first position after a silence lies far from the vehicle's own way through it. Then: end the plans.
+5. The first position after a silence lies far from the vehicle's own way through it, or positions move far from that
+   way later, together with that. Then: end the plans.
 6. While positions that have come back correct the vehicle's own velocity, no difference counts.
 
 False alarms (docs/soak.md): 0 of 200 missions, with a bound of 0.255 m/s. The largest difference was 0.036 m/s.
@@ -53,6 +54,8 @@ PLACES_NS, PLACE_NS = 30_000_000_000, 1_000_000_000  # mean offsets are compared
 DRIFT_S, DRIFT_PART = 2.0, 0.16
 # The same where the own way comes so near to a limit. Recorded flights reached 0.7 of this: 0.27 m in 3.3 s.
 NEAR_DRIFT_S, NEAR_M = 1.0, 0.5
+# Of the bound of a return, where the own way comes so near: simulated flights reached 0.3 of it, recorded ones 0.6.
+NEAR_RETURN_PART = 0.8
 LEAST_PLACES = 4  # that tell a drift from the delay of smoothing
 LEAST_OFFSETS = 3  # for a slope
 NOISE_SIGMA = 4.0  # standard deviations of a slope that chance may make
@@ -76,6 +79,8 @@ class VelocityState(msgspec.Struct, frozen=True, eq=False):
     is_contradicted: bool = False  # whether it was beyond its bound when last compared
     # Capture time from which it has been beyond its bound, as far as it counts [ns]; None while it is not
     apart_ns: int | None = None
+    # How far beside its own way they came back last (3,), and the bound of that [m]; None before
+    returned: tuple[list[float], float] | None = None
 
     def agrees(self, parameters: EnvelopeParameters) -> bool:
         """Whether no difference beyond the bound is known."""
@@ -89,18 +94,21 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     """
     at_ns, path, parameters = observation.at_ns, observation.motion.vehicle_path, observation.parameters
     offsets = _add_offset(state.offsets, observation)
-    elsewhere = _find_return(state.offsets, offsets, observation)
-    if elsewhere is not None:
-        s, off = elsewhere
-        text = f"positions came back {describe_vector(off)} m away from the vehicle's own way, after {s:.0f} s"
-        return replace(state, offsets=offsets), end_plans(EventCode.VELOCITY, text)
+    returned = _find_return(state.offsets, offsets, observation)
+    if returned is not None:
+        s, off, bound_m = returned
+        state = replace(state, returned=(off, bound_m))
+        if math.hypot(*off) > bound_m:
+            text = f"positions came back {describe_vector(off)} m away from the vehicle's own way, after {s:.0f} s"
+            return replace(state, offsets=offsets), end_plans(EventCode.VELOCITY, text)
     points = np.array([point for _, point in offsets])
     slope = _fit_slope(offsets, points, parameters)
     if slope is None:
         # Over a gap the vehicle's own distance is not known so well.
         places = state.places if len(offsets) > 1 else ()
         aligned = state.aligned if places else None
-        return VelocityState(offsets, places, aligned, is_contradicted=state.is_contradicted), NO_VERDICT
+        state = replace(state, offsets=offsets, places=places, aligned=aligned, apart_mps=None, apart_ns=None)
+        return state, NO_VERDICT
     resumed_ns = observation.motion.resumed_ns
     corrects = resumed_ns is not None and at_ns - parameters.window_ns < resumed_ns + CORRECTS_NS
     span_s, (begin, middle, end) = _find_way(path, offsets)
@@ -112,9 +120,12 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     apart_mps = math.hypot(*apart)
     bound_mps = parameters.disagreement_mps + _bound_noise_mps(offsets, observation.std_m)
     is_contradicted = apart_mps > bound_mps
-    apart_ns = (state.apart_ns or at_ns) if is_contradicted and not corrects else None
-    state = VelocityState(offsets, places, aligned, apart_mps, is_contradicted, apart_ns)
-    plain = observation.is_hinted or apart_mps >= PLAIN * bound_mps
+    counted_mps = apart_mps
+    if corrects and resumed_ns is not None:
+        counted_mps, bound_mps = _find_apart_since(resumed_ns + CORRECTS_NS, offsets, observation)
+    apart_ns = (state.apart_ns or at_ns) if counted_mps > bound_mps else None
+    state = VelocityState(offsets, places, aligned, apart_mps, is_contradicted, apart_ns, state.returned)
+    plain = observation.is_hinted or counted_mps >= PLAIN * bound_mps
     if apart_ns is not None and (plain or at_ns - apart_ns >= PERSISTS_NS):
         text = f"positions move otherwise than the vehicle itself says, by {describe_vector(apart)} m/s"
         return state, end_plans(EventCode.VELOCITY, text)
@@ -137,6 +148,20 @@ def update_silence(state: VelocityState, observation: TickObservation) -> tuple[
     return state, end_plans(EventCode.VELOCITY, text)
 
 
+def _find_apart_since(since_ns: int, offsets: Offsets, observation: PositionObservation) -> tuple[float, float]:
+    """Find the difference of both velocities by offsets from a time on, and its bound [m/s]; zero from too few.
+
+    Differences while the vehicle's own velocity is corrected say nothing of those after it.
+    """
+    kept, parameters = offsets[bisect_left(offsets, since_ns, key=_TIME) :], observation.parameters
+    slope = _fit_slope(kept, np.array([point for _, point in kept]), parameters)
+    if slope is None:
+        return 0.0, parameters.disagreement_mps
+    span_s, (begin, middle, end) = _find_way(observation.motion.vehicle_path, kept)
+    apart_mps = math.hypot(*_remove_delay(slope, begin, middle, end, span_s))
+    return apart_mps, parameters.disagreement_mps + _bound_noise_mps(kept, observation.std_m)
+
+
 def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:
     at_ns, distance = observation.at_ns, find_distance(observation.motion.vehicle_path, observation.at_ns)
     if distance is None:
@@ -149,8 +174,11 @@ def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:
 
 def _find_return(
     before: Offsets, offsets: Offsets, observation: PositionObservation
-) -> tuple[float, list[float]] | None:
-    """Find the time without positions [s], and how far (3,) [m] beside its own way they came back; None if near."""
+) -> tuple[float, list[float], float] | None:
+    """Find the time without positions [s], how far (3,) [m] beside its own way they came back, and the bound of that.
+
+    Return None where they do not come back, or the way is not known.
+    """
     if not before or not offsets or observation.motion.resumed_ns != observation.at_ns:
         return None
     (then_ns, then), (at_ns, now) = before[-1], offsets[-1]
@@ -162,7 +190,7 @@ def _find_return(
     off = [b - a + h for a, b, h in zip(then, now, half, strict=True)]
     # |o - o_0| > (0.8 s + 0.12 1/s t²) v_max
     bound_m = (RETURN_S + RETURN_1PS * s * s) * observation.parameters.disagreement_mps
-    return (s, off) if math.hypot(*off) > bound_m else None
+    return s, off, bound_m
 
 
 def _find_step(path: tuple[tuple[int, Vector], ...], at_ns: int) -> Vector:
@@ -191,6 +219,9 @@ def _find_drift(
     # ō + τ v
     now = place if aligned is None else [o + aligned[0] * v for o, v in zip(place, velocity, strict=True)]
     thens = [before for _, before, _ in places] if aligned is None else aligned[1]
+    away = _find_away(state, now, thens, places, observation)
+    if away is not None:
+        return away, places, aligned
     # No place is further away than the least bound, as a rule: then none needs its own.
     is_any_far = max(map(math.dist, repeat(now), thens), default=0.0) > NEAR_DRIFT_S * parameters.disagreement_mps
     for (since_ns, _, velocity_before), then in zip(places if is_any_far else (), thens, strict=False):
@@ -205,6 +236,26 @@ def _find_drift(
     if not places or at_ns - places[-1][0] >= PLACE_NS:
         places, aligned = (*places, (at_ns, tuple(place), velocity)), None
     return None, places, aligned
+
+
+def _find_away(
+    state: VelocityState,
+    now: list[float],
+    thens: Sequence[Sequence[float]],
+    places: Places,
+    observation: PositionObservation,
+) -> tuple[float, list[float]] | None:
+    """Find the change of offset over the last silence and since [s], [m]; None where it is within the bound of that."""
+    resumed_ns, disagreement_mps = observation.motion.resumed_ns, observation.parameters.disagreement_mps
+    if state.returned is None or not places or resumed_ns is None or places[0][0] < resumed_ns:
+        return None
+    (back, bound_m), s = state.returned, (observation.at_ns - places[0][0]) * 1e-9
+    off = [b + p - q for b, p, q in zip(back, now, thens[0], strict=True)]
+    # |o_r - o_0 + ō - ō_r| > max(b, 2 s v_max) + 0.16 t v_max, or max(0.8 b, 1 s v_max) + 0.16 t v_max
+    leads_out = _leads_out(observation, off)
+    part, begin_s = (NEAR_RETURN_PART, NEAR_DRIFT_S) if leads_out else (1.0, DRIFT_S)
+    bound_m = max(part * bound_m, begin_s * disagreement_mps) + DRIFT_PART * s * disagreement_mps
+    return (s, off) if math.hypot(*off) > bound_m else None
 
 
 def _leads_out(observation: PositionObservation, off: list[float]) -> bool:
