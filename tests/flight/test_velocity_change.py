@@ -313,7 +313,9 @@ def compare(
 @pytest.mark.parametrize(("ns", "bound_mps"), [(HALF_S_NS, AGREE_MPS), (2 * HALF_S_NS, 0.25 + 0.3)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_changes_agree_up_to_a_bound_that_grows_with_time(ns: int, bound_mps: float, sign: float) -> None:
-    at_bound = compare(north(sign * bound_mps), ZERO, ns=ns, model=north(sign * 0.3 * bound_mps))
+    at_bound = compare(
+        north(sign * (0.5 + bound_mps)), north(sign * 0.5), ns=ns, model=north(sign * (0.5 + 0.3 * bound_mps))
+    )
     assert (at_bound.agreed_ns, at_bound.disagrees_ns) == (START_NS + ns, None)
     beyond = compare(ZERO, north(sign * just_more(bound_mps)), ns=ns, disagrees_ns=None)
     assert (beyond.agreed_ns, beyond.disagrees_ns) == (None, START_NS + ns)
@@ -324,10 +326,10 @@ def test_inertial_data_three_times_as_near_to_setpoints_do_not_drift(model_mps: 
     own_mps = (
         0.375  # less than 0.25 m/s and half a second of drift; |Δv - Δm| = 3 |Δi - Δm| where the model has 0.09375
     )
-    state = compare(north(own_mps), ZERO, model=north(model_mps))
+    state = compare(north(0.5 + own_mps), north(0.5), model=north(0.5 + model_mps))
     assert (state.agreed_ns is not None) == agrees == (state.disagrees_ns is None)
     # So far apart that nothing but the drift explains it.
-    assert compare(north(0.25), ZERO, model=ZERO).agreed_ns is not None
+    assert compare(north(0.75), north(0.5), model=north(0.5)).agreed_ns is not None
 
 
 @pytest.mark.parametrize(("for_ns", "finds"), [(50 * MS - 1, False), (50 * MS, True)])
@@ -386,26 +388,48 @@ def test_the_velocity_at_the_begin_of_the_window_is_kept_where_the_own_one_is_wr
 
 @pytest.mark.parametrize(
     ("ns", "own_mps", "is_supported"),
-    [(HALF_S_NS, GUSTS_MPS, True), (HALF_S_NS, just_more(GUSTS_MPS), False), (HALF_S_NS - 1, 0.0, False)],
+    [(HALF_S_NS, 1.0 + GUSTS_MPS, True), (HALF_S_NS, 1.001 + GUSTS_MPS, False), (HALF_S_NS - 1, 1.0, False)],
 )
 def test_setpoints_support_the_velocity_within_gusts_from_half_a_second_on(
     ns: int, own_mps: float, is_supported: bool
 ) -> None:
-    state = compare(north(own_mps), None, ns=ns, first=(ZERO, None, ZERO))
+    state = compare(north(own_mps), None, ns=ns, first=(ZERO, None, ZERO), model=north(1.0))
     assert (state.agreed_ns == START_NS + ns) == is_supported and state.disagrees_ns is None
     # Inertial data that were found wrong count as none.
-    wrong = compare(north(own_mps), north(9.0), ns=ns, inertial_wrong_ns=START_NS)
+    wrong = compare(north(own_mps), north(9.0), ns=ns, model=north(1.0), inertial_wrong_ns=START_NS)
     assert (wrong.agreed_ns == START_NS + ns) == is_supported
     assert wrong.disagrees_ns == (START_NS if is_found(wrong) == (True, True) else None)
-    both = compare(north(own_mps), north(9.0), ns=ns, inertial_wrong_ns=START_NS, velocity_wrong_ns=START_NS)
+    both = compare(
+        north(own_mps), north(9.0), ns=ns, model=north(1.0), inertial_wrong_ns=START_NS, velocity_wrong_ns=START_NS
+    )
     assert (both.agreed_ns, both.velocity_wrong_ns) == (None, START_NS)
 
 
 def test_inertial_data_support_the_velocity_from_half_a_second_on() -> None:
     # Over less, a mirrored velocity changes alike, too.
     for ns, agreed_ns in ((HALF_S_NS, START_NS + HALF_S_NS), (HALF_S_NS - 1, None)):
-        state = compare(ZERO, ZERO, ns=ns)
+        state = compare(north(0.3), north(0.3), ns=ns)
         assert (state.agreed_ns, state.disagrees_ns) == (agreed_ns, None)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(("change_mps", "supports"), [(0.25, False), (just_more(0.25), True), (-0.251, True)])
+def test_only_a_change_supports_the_velocity(change_mps: float, supports: bool) -> None:
+    """One that is mirrored or late agrees with everything as long as the vehicle does not accelerate."""
+    change = north(change_mps)
+    for gained in (change, None):
+        first = (ZERO, None if gained is None else ZERO, ZERO)
+        state = compare(change, gained, model=change, first=first)
+        assert (state.supported_ns is not None, state.disagrees_ns) == (supports, None)
+        assert state.agrees(state.agreed_ns or 0) and state.supports_velocity(state.agreed_ns or 0) == supports
+
+
+def test_an_own_velocity_that_was_found_wrong_or_has_stopped_is_missing() -> None:
+    assert not INITIAL.is_missing(START_NS)
+    assert VelocityChangeState(velocity_wrong_ns=START_NS).is_missing(START_NS)
+    # A vehicle that sends it once a second has not stopped.
+    stopped = VelocityChangeState(right_ns=START_NS)
+    assert [stopped.is_missing(START_NS + 1500 * MS + ns) for ns in (0, 1)] == [False, True]
 
 
 @pytest.mark.parametrize(
@@ -559,7 +583,9 @@ def test_one_message_does_not_repeat_itself(repeats: bool) -> None:
 
 def test_times_and_bounds_count_to_the_last_nanosecond_and_bit() -> None:
     agreed = VelocityChangeState(agreed_ns=START_NS)
-    assert agreed.supports_velocity(START_NS + 300 * MS) and not agreed.supports_velocity(START_NS + 300 * MS + 1)
+    assert agreed.agrees(START_NS + 300 * MS) and not agreed.agrees(START_NS + 300 * MS + 1)
+    supported = VelocityChangeState(agreed_ns=START_NS + MS, supported_ns=START_NS)
+    assert [supported.supports_velocity(START_NS + 300 * MS + ns) for ns in (0, 1)] == [True, False]
     for later_ns, is_wrong in ((3_000 * MS, True), (3_000 * MS + 1, False)):
         tick = TickObservation(seen(START_NS + later_ns), Motion(), PARAMETERS)
         assert is_found(update(VelocityChangeState(inertial_wrong_ns=START_NS), tick, NO_POSITIONS))[1] == is_wrong

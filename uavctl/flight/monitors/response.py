@@ -171,7 +171,7 @@ def update(
     state = _add_sample(state, shown, tick)
     by_inertial = tick.inertial_mps2 is not None
     is_silent = state.heard_ns is None or tick.at_ns - state.heard_ns > SILENT_NS
-    is_supported = change.supports_velocity(tick.at_ns)
+    is_supported = change.agrees(tick.at_ns)
     if by_inertial and not is_supported and not _is_witnessed(observation):
         return state, NO_VERDICT
     evidence, kind = compute_evidence(state, observation.parameters.unexplained_mps2)

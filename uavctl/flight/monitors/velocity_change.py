@@ -3,7 +3,8 @@
 1. Over the last second, or since they last were compared, three changes of the velocity are known: of the vehicle's own
    velocity (Δv), the integral of its inertial data (Δi), and what the setpoints give (Δm). None needs a position.
 2. Δv and Δi that are near each other are both right: then positions that contradict them are wrong. Without inertial
-   data, or where these are wrong, so is a Δv that is as near to Δm as gusts explain.
+   data, or where these are wrong, so is a Δv that is as near to Δm as gusts explain. Changes no larger than a
+   disagreement show nothing: a velocity that is mirrored or late makes none, either.
 3. Else the one that is further from Δm is wrong, with or without the acceleration d that positions showed last beside
    the setpoints; both are, if both are further than gusts explain. Where Δv is known to be wrong, only Δi is compared.
 4. An own velocity that repeats to the last bit while Δm grows is wrong, too. So is one that leaps from one message to
@@ -42,6 +43,7 @@ INERTIAL_DRIFT_MPS2 = 0.3  # of a velocity by inertial data: a tilt of two degre
 LONE_GUSTS = 1.2
 NEARER = 3.0  # times as near to the setpoints as the own velocity: inertial data do not come so near by chance
 INERTIAL_DISTRUST_NS = 3_000_000_000  # then inertial data are compared again
+STOPPED_NS = 1_500_000_000  # then the own velocity has stopped: a vehicle may send it once a second
 LEAST_S = 0.5  # over less, setpoints alone say nothing of an own velocity
 RECENT_NS = 300_000_000  # an agreement counts for so long
 REPEATS_NS = 1_000_000_000  # even a velocity that comes twice a second has changed in this time
@@ -62,6 +64,7 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
     # Time [ns], integral of inertial data, model's [m/s], of the window, where no own velocity comes; oldest first
     lone: tuple[tuple[int, Vector, Vector], ...] = ()
     agreed_ns: int | None = None  # when both changes last agreed [ns]; None before
+    supported_ns: int | None = None  # when they last agreed on one that is larger than a disagreement [ns]; None before
     confirmed_ns: int | None = None  # when both last agreed on a change that a wrong velocity would not have [ns]
     disagrees_ns: int | None = None  # time since which they do not [ns]; None while they do
     repeated: tuple[Vector, Vector, int] | None = None  # the own velocity, the model's when it first came, that time
@@ -76,6 +79,11 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
         """Whether the own velocity or inertial data were found wrong."""
         return self.velocity_wrong_ns is not None or self.inertial_wrong_ns is not None
 
+    def is_missing(self, at_ns: int) -> bool:
+        """Whether the own velocity came before, and was found wrong or has stopped."""
+        has_stopped = self.right_ns is not None and at_ns - self.right_ns > STOPPED_NS
+        return has_stopped or self.velocity_wrong_ns is not None
+
     @property
     def contradicts(self) -> bool:
         """Whether both changes contradict each other, or one of them was found wrong."""
@@ -85,9 +93,13 @@ class VelocityChangeState(msgspec.Struct, frozen=True):
         """Whether the own velocity has repeated to the last bit for longer than any message takes."""
         return self.repeated is not None and at_ns - self.repeated[2] > REPEATS_NS
 
-    def supports_velocity(self, at_ns: int) -> bool:
+    def agrees(self, at_ns: int) -> bool:
         """Whether inertial data, or setpoints without right ones, have changed as the own velocity has, just now."""
         return self.velocity_wrong_ns is None and self.agreed_ns is not None and at_ns - self.agreed_ns <= RECENT_NS
+
+    def supports_velocity(self, at_ns: int) -> bool:
+        """Whether they have so, and changed at all."""
+        return self.agrees(at_ns) and self.supported_ns is not None and at_ns - self.supported_ns <= RECENT_NS
 
     def confirms_velocity(self, at_ns: int) -> bool:
         """Whether inertial data have changed as the own velocity has within the last second, and by much."""
@@ -154,7 +166,9 @@ def _compare(
     gusts_mps = parameters.disagreement_mps + bound_gusts_mps(s, parameters)
     explained_mps = 2.0 * gusts_mps
     is_right = own_mps <= gusts_mps and state.velocity_wrong_ns is None
-    supported = replace(state, agreed_ns=at_ns if is_right and s >= LEAST_S else state.agreed_ns, disagrees_ns=None)
+    supported = replace(state, disagrees_ns=None)
+    if is_right and s >= LEAST_S:
+        supported = _note_agreement(supported, model, at_ns, parameters)
     if first[2] is None or last[2] is None:
         return supported
     gained = _subtract(last[2], first[2])
@@ -163,12 +177,10 @@ def _compare(
     drift_mps = INERTIAL_DRIFT_MPS2 * s if own_mps < NEARER * gained_mps else 0.0
     if not state.has_found_wrong and math.dist(own, gained) <= parameters.disagreement_mps + drift_mps:
         is_plain = math.hypot(*gained) > 2.0 * parameters.disagreement_mps
-        return replace(
-            state,
-            agreed_ns=at_ns if s >= LEAST_S else state.agreed_ns,
-            confirmed_ns=at_ns if s >= LEAST_S and is_plain else state.confirmed_ns,
-            disagrees_ns=None,
+        agreed = replace(
+            state, confirmed_ns=at_ns if s >= LEAST_S and is_plain else state.confirmed_ns, disagrees_ns=None
         )
+        return _note_agreement(agreed, gained, at_ns, parameters) if s >= LEAST_S else agreed
     right_mps = _subtract(first[1], first[3])
     if state.inertial_wrong_ns is not None:
         if is_right:
@@ -191,6 +203,14 @@ def _compare(
         right_beside_model_mps=right_mps if is_velocity_wrong else None,
         right_ns=first[0] if is_velocity_wrong else None,
     )
+
+
+def _note_agreement(
+    state: VelocityChangeState, change: Vector, at_ns: int, parameters: EnvelopeParameters
+) -> VelocityChangeState:
+    """Note that both changes agree, and whether on one (3,) [m/s] that shows something."""
+    is_shown = math.hypot(*change) > parameters.disagreement_mps
+    return replace(state, agreed_ns=at_ns, supported_ns=at_ns if is_shown else state.supported_ns)
 
 
 def _judge_alone(
