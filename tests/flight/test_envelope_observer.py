@@ -39,10 +39,13 @@ from scipy.linalg import expm
 from uavctl.arrays import SECOND_NS
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
+from uavctl.flight.monitors.braking import BrakingState
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.observer import Observer
-from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity
+from uavctl.flight.monitors.vehicle_velocity import VelocityObservation, find_confirmed_velocity, judge_braking
+from uavctl.flight.monitors.velocity_change import VelocityChangeState
+from uavctl.flight.monitors.verdict import Action
 from uavctl.flight.supervise import ENVELOPE_CODES
 from uavctl.records import Vec3, VehicleMotion
 
@@ -441,6 +444,42 @@ def test_what_was_sent_is_a_witness_for_ten_seconds() -> None:
     assert trusted_velocity(changed(watching, began_ns=None), tick, 0.0, PARAMETERS) is None
 
 
+@pytest.mark.fault(94)
+def test_a_prediction_misleads_sooner_where_the_own_velocity_is_supported() -> None:
+    for apart_mps, inconsistent in ((0.5, False), (0.51, True)):
+        watching, tick = told(ZERO, (0.0, -apart_mps, 0.0), apart_mps=0.1)
+        supported = structs.replace(watching, velocity_change=VelocityChangeState(agreed_ns=AT_NS, supported_ns=AT_NS))
+        assert is_prediction_inconsistent(supported, tick, 0.0, PARAMETERS) == inconsistent
+        assert not is_prediction_inconsistent(watching, tick, 0.0, PARAMETERS)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(
+    ("own", "predicted", "began_mps", "ends"),
+    [
+        ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0), 0.199, True),
+        ((0.3, 0.0, 0.0), (0.3, 0.0, 0.0), 0.2, False),  # both point the same way
+        ((0.3, 0.0, 0.0), (-0.15, 0.3, 0.0), 0.2, False),  # apart by less than 120°
+        ((0.3, 0.0, 0.0), (-0.18, 0.3, 0.0), 0.199, True),
+        ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0), 0.201, False),  # braking does not make it faster
+        ((0.3, 0.0, 0.0), (-0.3, 0.0, 0.0), None, False),  # it does not brake on it
+        ((0.3, 0.0, 0.0), (-0.24, 0.0, 0.0), 0.1, False),  # gusts turn so slow a prediction
+        ((0.24, 0.0, 0.0), (-0.3, 0.0, 0.0), 0.1, False),
+        ((0.0, 0.0, 0.3), (-0.3, 0.0, NAN3[0]), 0.1, False),  # the plant has no such axis
+        ((0.3, 0.0, 0.0), (-0.3, 0.0, NAN3[0]), 0.1, True),
+    ],
+)
+def test_braking_by_a_velocity_that_it_makes_grow_ends(
+    own: Vec3, predicted: Vec3, began_mps: float | None, ends: bool
+) -> None:
+    braking = BrakingState(None if began_mps is None else (AT_NS - SECOND_NS, began_mps))
+    watching = structs.replace(INITIAL, braking=braking)
+    observation = VelocityObservation(watching, AT_NS, own, predicted, 3.0, PARAMETERS)
+    verdict = judge_braking(observation)
+    assert (verdict.action is Action.END_PLANS, verdict.is_none) == (ends, not ends)
+    assert judge_braking(structs.replace(observation, own_mps=None)).is_none
+
+
 @pytest.mark.parametrize(
     ("apart_mps", "age_s", "inconsistent"), [(1.0, 0.0, False), (1.01, 0.0, True), (1.6, 1.0, False)]
 )
@@ -532,7 +571,15 @@ def later(watching: MonitorState, by_ns: int) -> MonitorState:
     rows = {name: moved(at(group, name)) for group, name in pairs}
     change = watching.velocity_change
     names_of_change = (
-        *("agreed_ns", "confirmed_ns", "disagrees_ns", "velocity_wrong_ns", "inertial_wrong_ns", "right_ns"),
+        *(
+            "agreed_ns",
+            "supported_ns",
+            "confirmed_ns",
+            "disagrees_ns",
+            "velocity_wrong_ns",
+            "inertial_wrong_ns",
+            "right_ns",
+        ),
     )
     change_times: dict[str, Any] = {
         name: getattr(change, name) + by_ns for name in names_of_change if getattr(change, name) is not None

@@ -141,6 +141,8 @@ def supervise(state: ControlState, context: TickContext, measured: Measured) -> 
         view = view_filter(distrust_inertial(view.history, at_ns), context)
     return_ordered = _is_return_ordered(state, view, context)
     monitors, breach = _watch_flight(state, view, measured, context, return_ordered)
+    if breach.is_none and context.was_in_control and state.monitors.breach is None:
+        breach = _judge_braking(state, view, context)
     sources = _judge_sources(measured, context)
     dropped_after_ns, consecutive = samples.dropped_after_ns, samples.consecutive_samples
     if not (breach.is_none and sources.is_none and contradiction.is_none):
@@ -203,7 +205,7 @@ def _judge_estimate(
     resumed_ns, knows_noise = state.monitors.engaged.motion.resumed_ns, measured.samples.sources.noise.is_known
     returned_ns = math.inf if resumed_ns is None else context.at_ns - resumed_ns
     has_returned = returned_ns < RETURNED_NS
-    if has_returned and knows_noise and change.supports_velocity(context.at_ns):
+    if has_returned and knows_noise and change.agrees(context.at_ns):
         is_new = any(read_capture_ns(sample) == belief.inertial.distrusted_ns for sample in measured.samples.accepted)
         is_recent = (view.age_steps or 0) < PLAYED_OUT_STEPS
         compares = returned_ns >= CORRECTS_NS
@@ -358,6 +360,17 @@ def _judge_silence(monitors: MonitorState, view: FilterView, context: TickContex
     if not is_lost or (is_wind and not _is_near_limit(view, context)):
         return NO_VERDICT
     return _CARRIED_BY_NOTHING if are_positions_lost(view.belief, context.at_ns) else NO_VERDICT
+
+
+def _judge_braking(state: ControlState, view: FilterView, context: TickContext) -> Verdict:
+    """Judge whether braking goes on where neither a position nor inertial data show which velocity is right."""
+    belief = view.belief
+    if context.mode is not ControlMode.BRAKE or belief is None or belief.inertial.distrusted_ns is None:
+        return NO_VERDICT
+    observation = observe_velocity(state.monitors.engaged, view.estimate, context)
+    if observation is None or not are_positions_lost(belief, context.at_ns):
+        return NO_VERDICT
+    return vehicle_velocity.judge_braking(observation)
 
 
 def _are_supported(change: VelocityChangeState, at_ns: int) -> bool:

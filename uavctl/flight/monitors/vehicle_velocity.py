@@ -4,7 +4,8 @@
    with it, or the predicted velocity is near it, or (in a flight's first ten seconds) the velocity that setpoints gave
    is. Else: distrust the vehicle's velocity.
 2. Without a position for two steps: a prediction far from it is wrong, and so is a plan of it. Then: brake.
-3. A velocity that inertial data carried on without a position has drifted away from it. Then: distrust inertial data.
+3. Braking by it makes it grow, and the predicted one points against it. Then: end the plans.
+4. A velocity that inertial data carried on without a position has drifted away from it. Then: distrust inertial data.
 
 These compare without a memory of their own, so each is a `judge(observation) -> Verdict`.
 
@@ -14,6 +15,7 @@ missions were braked for a prediction).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import msgspec
@@ -22,10 +24,15 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.engaged import MonitorState
 from uavctl.flight.monitors.motion import bound_gusts_mps
 from uavctl.flight.monitors.observation import EnvelopeParameters, read_vehicle_velocity
-from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict, brake
+from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Verdict, brake, end_plans
 from uavctl.records import Vec3, VehicleMotion
 
-MISLEADS = 4.0  # disagreements between a prediction and the vehicle that gusts alone do not make
+# Disagreements between a prediction and the vehicle that gusts alone do not make; the same where inertial data, or
+# setpoints, change as its own velocity does.
+MISLEADS, SUPPORTED_MISLEADS = 4.0, 2.0
+# Speed from which two velocities point against each other, and a gain of speed that braking by the right one does not
+# make: without it, 1 of 80 flights in gusts of 8 m/s was let go.
+OPPOSED_MPS, FASTER_MPS = 0.25, 0.1
 MODEL_COUNTS_S = 10.0  # of a flight: for so long the setpoints say something of the velocity
 _DISTRUSTED = Verdict(Action.DISTRUST_VEHICLE_VELOCITY, EventCode.VELOCITY)
 
@@ -75,11 +82,30 @@ def find_trusted_velocity(observation: VelocityObservation) -> Vec3 | None:
 def judge_prediction(observation: VelocityObservation) -> Verdict:
     """Judge a prediction without fresh positions by the vehicle's own velocity."""
     velocity, parameters = find_trusted_velocity(observation), observation.parameters
-    within_mps = MISLEADS * parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
+    change = observation.monitors.velocity_change
+    misleads = SUPPORTED_MISLEADS if change.supports_velocity(observation.at_ns) else MISLEADS
+    within_mps = misleads * parameters.disagreement_mps + bound_gusts_mps(observation.age_s, parameters)
     if velocity is None or _is_near(velocity, observation.predicted_mps, within_mps):
         return NO_VERDICT
     return brake(
         EventCode.PREDICTION_INCONSISTENT, "the vehicle moves otherwise than was predicted, and no position says why"
+    )
+
+
+def judge_braking(observation: VelocityObservation) -> Verdict:
+    """Judge whether braking may go on by the vehicle's own velocity: one that points the wrong way grows by it."""
+    own_mps, began = observation.own_mps, observation.monitors.braking.began
+    if own_mps is None or began is None:
+        return NO_VERDICT
+    known = [(v, other) for v, other in zip(own_mps, observation.predicted_mps, strict=True) if math.isfinite(other)]
+    speed_mps, predicted_speed_mps = math.hypot(*own_mps), math.hypot(*(other for _, other in known))
+    # v' v_predicted ≤ -½ |v| |v_predicted|: apart by 120° or more
+    is_opposed = sum(v * other for v, other in known) <= -0.5 * speed_mps * predicted_speed_mps
+    is_faster = speed_mps >= began[1] + FASTER_MPS
+    if not (is_opposed and is_faster) or min(speed_mps, predicted_speed_mps) < OPPOSED_MPS:
+        return NO_VERDICT
+    return end_plans(
+        EventCode.BRAKING, "braking makes the vehicle faster by its own velocity, and slower by the predicted one"
     )
 
 
