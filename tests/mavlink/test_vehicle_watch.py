@@ -81,7 +81,7 @@ def test_how_long_it_has_been_up_is_told_by_its_clock_and_goes_on_between_its_me
 
 
 @pytest.mark.fault(20)
-@pytest.mark.parametrize("young_ms", [0, 100, 58_000])
+@pytest.mark.parametrize("young_ms", [0, 100, 49_900])
 def test_a_clock_that_goes_back_is_a_restart(young_ms: int) -> None:
     link, vehicle = heard()
     assert not events(link.receive(vehicle.local_position(young_ms), NOW + SECOND).items)  # one word may be garbage
@@ -90,6 +90,24 @@ def test_a_clock_that_goes_back_is_a_restart(young_ms: int) -> None:
     assert [status.boots for status in statuses(items)] == [1]  # at once, not with the next heartbeat
     assert not events(link.receive(vehicle.local_position(young_ms + 80), NOW + SECOND).items)
     assert newest(link, vehicle).boots == 1
+
+
+@pytest.mark.fault(20, 94)
+@pytest.mark.parametrize(
+    ("before_ms", "boot_ms", "restarts"),
+    [
+        (60_000, 50_000, False),  # messages that are 10 s older than those before
+        (60_000, 49_999, True),
+        (5_000, 2_001, False),  # a second later: a clock that has begun anew shows two at most
+        (5_000, 2_000, True),
+    ],
+)
+def test_messages_that_become_late_are_no_restart(before_ms: int, boot_ms: int, restarts: bool) -> None:
+    link, vehicle = heard(before_ms)
+    told = [
+        event for _ in range(3) for event in events(link.receive(vehicle.local_position(boot_ms), NOW + SECOND).items)
+    ]
+    assert [event.code for event in told] == ["vehicle-reboot"] * restarts
 
 
 @pytest.mark.fault(20)

@@ -3,7 +3,8 @@
 1. Keep the last `time_boot_ms` of each kind of message.
 2. Accept the next one if it advances about as much as our clock did.
 3. Keep any other value as a candidate. A second message must confirm it within `CONFIRM_NS`.
-4. Report a restart if the confirmed value is older than before, or shows an uptime that is short enough.
+4. Report a restart if the confirmed value is older than messages become on a link, or shows an uptime that is short
+   enough.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 MAX_BACKSTEP_MS = 1000  # a clock that goes back by more is another one; reordering on a link is less
+MAX_LATE_MS = 10_000  # messages that are no older than this are late, unless the clock can have begun anew since
+BEGINS_MS = 1000  # a clock that has begun anew shows no more than the time since, and the delay of a message
 MAX_ADVANCE_MS = 30_000  # more than our clock: late messages, and fast simulated clocks
 CONFIRM_NS = 5_000_000_000  # time limit for the second message of another clock
 _WRAP_MS = 2**32
@@ -54,9 +57,7 @@ class BootClock:
             self._accept(kind, reading)
         elif candidate is not None and at_ns - candidate.at_ns <= CONFIRM_NS and _is_same_clock(candidate, reading):
             del self._candidates[kind]
-            has_restarted = known.is_confirmed and (
-                _compute_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading)
-            )
+            has_restarted = known.is_confirmed and _may_have_restarted(known, reading)
             if has_restarted:  # readings of other kinds are older than the restart
                 self._readings.clear()
                 self._candidates.clear()
@@ -92,4 +93,7 @@ def _is_same_clock(before: _Reading, after: _Reading) -> bool:
 
 def _may_have_restarted(before: _Reading, after: _Reading) -> bool:
     """Return whether a restart between two readings is possible; after 24 days of uptime a clock seems to jump."""
-    return after.boot_ms <= _compute_elapsed_ms(before, after) + MAX_ADVANCE_MS
+    advance_ms, elapsed_ms = _compute_advance_ms(before, after), _compute_elapsed_ms(before, after)
+    if advance_ms < 0:
+        return advance_ms < -MAX_LATE_MS or after.boot_ms <= elapsed_ms + BEGINS_MS
+    return after.boot_ms <= elapsed_ms + MAX_ADVANCE_MS
