@@ -35,8 +35,9 @@ PARAMETERS = FallbackParameters(
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, ENVELOPE, STOP, TO_LAND = (
+RECOVER, VELOCITY_WRONG, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, ENVELOPE, STOP, TO_LAND = (
     FallbackReason.RECOVER,
+    FallbackReason.VELOCITY_WRONG,
     FallbackReason.CONTROLLER_FAILED,
     FallbackReason.POSITIONS_DISTRUSTED,
     FallbackReason.ENVELOPE,
@@ -193,6 +194,9 @@ def test_holding_accelerates_no_vehicle_to_a_limit_that_it_retreats_from() -> No
         (Fallback(BRAKE, 4, STOP), STOP, Fallback(BRAKE, 4, STOP)),
         (Fallback(HOLD, 4), POSITIONS_DISTRUSTED, Fallback(BRAKE, 9, POSITIONS_DISTRUSTED)),
         (Fallback(HOLD, 4), CONTROLLER_FAILED, Fallback(BRAKE, 9, CONTROLLER_FAILED)),
+        (Fallback(HOLD, 4), VELOCITY_WRONG, Fallback(HOLD, 4, VELOCITY_WRONG)),  # no velocity is left to brake on
+        (Fallback(BRAKE, 4), VELOCITY_WRONG, Fallback(BRAKE, 4, VELOCITY_WRONG)),
+        (None, VELOCITY_WRONG, Fallback(BRAKE, 9, VELOCITY_WRONG)),
         (Fallback(BRAKE, 4, CONTROLLER_FAILED), POSITIONS_DISTRUSTED, Fallback(BRAKE, 4, POSITIONS_DISTRUSTED)),
         (Fallback(BRAKE, 4, POSITIONS_DISTRUSTED), CONTROLLER_FAILED, Fallback(BRAKE, 4, POSITIONS_DISTRUSTED)),
         (Fallback(HOLD, 4, STOP), STOP, Fallback(HOLD, 4, STOP)),

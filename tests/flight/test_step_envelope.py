@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace as changed
 from typing import Any
 
+import numpy as np
 import pytest
 from envelope_rig import PARAMETERS, monitors, motion
 from flight_rig import (
@@ -26,6 +27,7 @@ from flight_rig import (
 )
 from msgspec.structs import replace
 
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.event_codes import EventCode
 from uavctl.flight import measure
 from uavctl.flight.controller import Controller
@@ -37,6 +39,7 @@ from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, InertialSample, StepInput, Vec3, VehicleStatus
+from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
 MILLIMETRES: Vec3 = (-2400.0, -1900.0, -700.0)
 N_TICKS = 30  # 1.5 s; positions count as absurd after 0.5 s
@@ -214,9 +217,9 @@ def test_inertial_data_that_are_no_numbers_are_nothing_that_the_vehicle_feels() 
     assert climbing((float("nan"), 0.0, 0.0)) == climbing(None)
 
 
-def fly_into_silence(steps: int) -> tuple[Controller, ControlState, list[StepInput]]:
+def fly_into_silence(steps: int, ours: Controller | None = None) -> tuple[Controller, ControlState, list[StepInput]]:
     """Fly five steps with positions, then H + 1 without; return the state, and the inputs of so many further steps."""
-    ours, last = controller(), 5 + make_controller().horizon + 1
+    ours, last = ours or controller(), 5 + make_controller().horizon + 1
     inputs = make_inputs(range((last + steps) * TICKS), make_step_samples(range(5, last + 1), steps=last + steps))
     state = make_initial_state()
     for inp in inputs[: last * TICKS]:
@@ -262,6 +265,82 @@ def test_a_velocity_that_was_found_wrong_and_repeats_ends_the_flight_beside_posi
     assert state.fallback.flown is not None
     wanted = FallbackReason.VELOCITY_WRONG if is_wrong and repeats_s > 1.0 else FallbackReason.RECOVER
     assert state.fallback.flown.reason is wanted
+
+
+def come_back(wrong_ns: int | None, right_ns: int | None) -> list[tuple[float, ControlState]]:
+    """Fly on positions again after a silence: times since the first of them [s], and states.
+
+    Args:
+        wrong_ns: When the own velocity is found wrong, since then; None for never.
+        right_ns: When it last came, before each tick; None where it never stopped.
+    """
+    ours, state, inputs = fly_into_silence(20)
+    states = []
+    for inp in inputs:
+        engaged = state.monitors.engaged
+        if engaged.motion.resumed_ns is not None:
+            change = VelocityChangeState(
+                velocity_wrong_ns=None if wrong_ns is None else engaged.motion.resumed_ns + wrong_ns,
+                right_ns=None if right_ns is None else inp.at_ns - right_ns,
+            )
+            state = replace(state, monitors=replace(state.monitors, engaged=replace(engaged, velocity_change=change)))
+            states.append(((inp.at_ns - engaged.motion.resumed_ns) * 1e-9, state))
+        state, _ = run_tick(state, inp, ours)
+    return states
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(
+    ("wrong_ns", "right_ns", "lands_s"),
+    [
+        (None, None, None),
+        (None, 1_500 * MS, None),
+        (None, 1_501 * MS, 1.0),
+        (-SECOND_NS, None, 2.0),
+        (SECOND_NS, None, 3.0),
+    ],
+)
+def test_positions_that_come_back_without_an_own_velocity_are_not_flown_on(
+    wrong_ns: int | None, right_ns: int | None, lands_s: float | None
+) -> None:
+    """It came before, and has stopped for longer than between two messages of any vehicle, or was found wrong."""
+    states = come_back(wrong_ns, right_ns)
+    assert any(state.mode is ControlMode.TRACK for _, state in states) == (lands_s is None)
+    if lands_s is not None:
+        reasons = [(s, state.fallback.flown.reason) for s, state in states if state.fallback.flown is not None]
+        ended_s = min(s for s, reason in reasons if reason is FallbackReason.VELOCITY_WRONG)
+        assert lands_s < ended_s <= lands_s + 2e-9 * TICK_NS  # a state is that before its tick
+
+
+class AskedSolver(StubSolver):
+    """Remembers the bounds of the inputs that it was asked for in each step."""
+
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
+        self.bounds = {**getattr(self, "bounds", {}), seq: preview.input_bounds}
+        return super().solve(seq, x, target, preview)
+
+
+@pytest.mark.fault(94)
+@pytest.mark.parametrize(("widest_mps2", "wanted_mps2"), [(3.0, 0.7), (0.5, 0.5)])
+def test_plans_after_hold_begin_gently(widest_mps2: float, wanted_mps2: float) -> None:
+    plant = small_plant()
+    solver, widest = AskedSolver(plant), (np.full(plant.n_u, -widest_mps2), np.full(plant.n_u, widest_mps2))
+    ours = changed(make_controller(solver), envelope=ANYTHING, input_bounds=widest)
+    _, state, inputs = fly_into_silence(20, ours)
+    assert not any(solver.bounds.values())
+    left_ns = None
+    for inp in inputs:
+        before = state.mode
+        state, _ = run_tick(state, inp, ours)
+        if before is ControlMode.HOLD and state.mode is ControlMode.TRACK:
+            left_ns = inp.at_ns
+    assert left_ns is not None
+    asked = [(step, bounds) for step, bounds in solver.bounds.items() if START_NS + step * DT_NS >= left_ns]
+    # 1.5 s are eight steps, the first one at the end of HOLD.
+    assert len(asked) > 9 and not any(bounds for _, bounds in asked[8:])
+    for _, bounds in asked[:8]:
+        assert bounds is not None
+        np.testing.assert_allclose(bounds, ([-wanted_mps2] * plant.n_u, [wanted_mps2] * plant.n_u))
 
 
 @pytest.mark.fault(94)

@@ -42,7 +42,7 @@ from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.risk import set_risk
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
-from uavctl.flight.supervise import Supervised, are_positions_lost, observe_velocity
+from uavctl.flight.supervise import RETURNED_NS, Supervised, are_positions_lost, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.plant import Plant
@@ -51,12 +51,18 @@ MISSION_OVER = "the mission is over: landing"
 # Positions that come back after a silence correct the vehicle's own velocity in their first second. Then they are
 # compared with it. No plan flies again before this time is over.
 COMPARED_NS = CORRECTS_NS + 400_000_000
+# The vehicle's own velocity has to confirm them within this time: a wrong one is believed again after 1.4 s at the
+# earliest; one that has stopped comes back when they do, or not at all.
+RIGHT_AGAIN_NS, BACK_AGAIN_NS = 2_000_000_000, 1_000_000_000
+# Plans after HOLD accelerate no more than this for so long. Positions that came back wrong contradict the vehicle's own
+# velocity once it moves, after half a second: with 3 m/s² it is at 1.5 m/s by then.
+GENTLE_NS, GENTLE_MPS2 = 1_500_000_000, 0.7
 # Age of a position up to which inertial data alone, without the vehicle's own velocity, make a new plan: nothing would
 # show that they err. With five positions a second and 60 % of them lost, one in ten is older.
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 _FINAL_TEXTS = {
-    FallbackReason.VELOCITY_WRONG: "the vehicle's own velocity was found wrong, and it repeats, or no position came",
+    FallbackReason.VELOCITY_WRONG: "the vehicle's own velocity was found wrong or has stopped, and nothing replaces it",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
     FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
     FallbackReason.ENVELOPE: "what is seen cannot be",
@@ -75,6 +81,7 @@ class Decided(msgspec.Struct, frozen=True, eq=False):
     order: Command | None  # order that still waits for a plan
     consecutive_samples: int  # fresh samples in a row
     hold_point_m: Vec3 | None
+    left_hold_ns: int | None  # boundary of the first plan after the last HOLD [ns]; None before
     biases: Biases
     jump_suspected: bool
     fault: str  # why a controller of another package is given up; empty as long as it is not
@@ -106,6 +113,11 @@ class _Phase(msgspec.Struct, frozen=True, eq=False):
     def view(self) -> FilterView:
         return self.supervised.view
 
+    @property
+    def wanted_samples(self) -> int:
+        """Fresh positions in a row before plans fly again."""
+        return self.controller.fallback.recover_samples
+
 
 def decide(state: ControlState, context: TickContext, supervised: Supervised, ordered: Ordered) -> Decided:
     """Decide the mode: wait, plan, or fallback."""
@@ -136,6 +148,7 @@ def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
         order=ordered.order,
         consecutive_samples=supervised.consecutive_samples,
         hold_point_m=state.fallback.hold_point_m,
+        left_hold_ns=state.fallback.left_hold_ns,
         biases=_update_biases(phase),
         jump_suspected=is_final and jump_suspected,
         fault=supervised.monitors.external.fault,
@@ -223,7 +236,7 @@ def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
     if view.age_steps >= controller.horizon:
         reason = f"age of information {view.age_steps} has reached H = {controller.horizon}"
         return _fall_back(draft, draft.fallback or begin_fallback(at_ns), phase, reason)
-    wanted = controller.fallback.recover_samples
+    wanted = phase.wanted_samples
     if draft.fallback is not None and are_positions_compared(phase.context, phase.supervised):
         reason = "positions have come back, and are compared with the vehicle's velocity"
         is_fresh = draft.consecutive_samples >= wanted
@@ -269,11 +282,13 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     if draft.order is not None:
         reason = f"{reason}, as ordered: {describe_order(draft.order)}"
     mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
+    if draft.fallback is not None and draft.fallback.mode is ControlMode.HOLD:
+        draft = replace(draft, left_hold_ns=context.boundary_ns)
     mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
     target, preview = make_question(controller.mission, mission, context.boundary_ns)
     is_first = is_led(controller.mission, mission, context.boundary_ns)
     preview = set_risk(preview, phase.state.risk, controller.risk, is_led=is_first)
-    preview = _complete_preview(preview, base, cov, phase)
+    preview = _complete_preview(preview, base, cov, draft, phase)
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask_solver(controller.solver, context.step, base, target, preview, shape, controller.design_id)
     draft = replace(draft, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
@@ -290,7 +305,7 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     )
 
 
-def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phase) -> Preview:
+def _complete_preview(preview: Preview, base: Estimate, cov: Array, draft: Decided, phase: _Phase) -> Preview:
     """Add data of the estimate and the last input to the question."""
     controller = phase.controller
     # u = u_sent + d: the solver counts what acts on the plant in all
@@ -300,7 +315,7 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
         age=min(phase.view.age_steps or 0, controller.late_steps),
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
-        input_bounds=_shift_input_bounds(base.bias, controller),
+        input_bounds=_find_input_bounds(base.bias, draft.left_hold_ns, phase),
         sent_mps2=_select_axes(phase.state.plan.sent_mps2, controller.plant),
         braking=controller.braking if controller.outside else None,
     )
@@ -309,6 +324,19 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
 def _select_axes(vector: Vec3, plant: Plant) -> Array:
     """Return the entries (n_axes,) of a vector that the plant has."""
     return np.array([vector[AXES.index(axis)] for axis in plant.axes])
+
+
+def _find_input_bounds(bias: Vector, left_hold_ns: int | None, phase: _Phase) -> tuple[Array, Array] | None:
+    """Find the least and largest input of a plan, bias included; None where they are those of the design."""
+    controller = phase.controller
+    bounds = _shift_input_bounds(bias, controller)
+    is_new = left_hold_ns is not None and phase.context.boundary_ns - left_hold_ns < GENTLE_NS
+    if not is_new or controller.input_bounds is None:
+        return bounds
+    low, high = bounds or controller.input_bounds
+    push = np.array(bias) if bias else np.zeros(len(low))
+    # |u - d| ≤ 0.7 m/s²
+    return np.maximum(low, push - GENTLE_MPS2), np.minimum(high, push + GENTLE_MPS2)
 
 
 def _shift_input_bounds(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
@@ -399,7 +427,9 @@ def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
 
 
 def _is_velocity_lost(phase: _Phase) -> bool:
-    """Whether the vehicle's own velocity was found wrong, and it repeats, or no position comes."""
+    """Whether the vehicle's own velocity confirms no position, or is wrong, and repeats, or no position comes."""
+    if _confirms_no_position(phase):
+        return True
     supervised, at_ns = phase.supervised, phase.context.at_ns
     change = supervised.monitors.engaged.velocity_change
     if change.velocity_wrong_ns is None:
@@ -407,14 +437,28 @@ def _is_velocity_lost(phase: _Phase) -> bool:
     return change.repeats(at_ns) or are_positions_lost(supervised.view.belief, at_ns)
 
 
+def _confirms_no_position(phase: _Phase) -> bool:
+    """Whether positions are back, and the vehicle's own velocity has been missing for longer than it is waited for."""
+    supervised, at_ns = phase.supervised, phase.context.at_ns
+    monitors, change = supervised.monitors.engaged, supervised.monitors.engaged.velocity_change
+    resumed_ns, are_back = monitors.motion.resumed_ns, supervised.consecutive_samples >= phase.wanted_samples
+    if resumed_ns is None or not are_back or at_ns - resumed_ns >= RETURNED_NS or not change.is_missing(at_ns):
+        return False
+    if change.velocity_wrong_ns is None:
+        return at_ns - resumed_ns >= BACK_AGAIN_NS
+    return at_ns - max(resumed_ns, change.velocity_wrong_ns) >= RIGHT_AGAIN_NS
+
+
 def are_positions_compared(context: TickContext, supervised: Supervised) -> bool:
     """Whether positions have come back after a silence, and are compared before anything is flown on them.
 
-    They are for a while, and until they agree with the vehicle's own velocity.
+    They are for a while, and until they agree with the vehicle's own velocity, if there was one.
     """
     monitors = supervised.monitors.engaged
-    is_new = monitors.motion.resumed_ns is not None and context.at_ns - monitors.motion.resumed_ns < COMPARED_NS
-    return is_new or monitors.velocity.is_contradicted
+    resumed_ns = monitors.motion.resumed_ns
+    since_ns = math.inf if resumed_ns is None else context.at_ns - resumed_ns
+    is_alone = since_ns < RETURNED_NS and monitors.velocity_change.is_missing(context.at_ns)
+    return since_ns < COMPARED_NS or is_alone or monitors.velocity.is_contradicted
 
 
 def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:

@@ -6,8 +6,8 @@ A state machine of four modes, each with a time limit:
 
     reason                 from HOLD
     RECOVER                LAND after hold_s, or blind_hold_s, if configured; else it holds on
-    VELOCITY_WRONG         LAND once its zero has been sent, if configured; else STOPPED
-    CONTROLLER_FAILED      the same
+    VELOCITY_WRONG         LAND once its zero has been sent, if configured; else STOPPED; it does not brake again before
+    CONTROLLER_FAILED      LAND once its zero has been sent, if configured; else STOPPED
     POSITIONS_DISTRUSTED   the same
     ENVELOPE               the same; it does not brake before, as no position is believed: level at once
     STOP                   LAND once its zero has been sent, if configured; else STOPPED
@@ -64,7 +64,7 @@ class FallbackReason(IntEnum):
     """Reason of the fallback, which decides its end. A greater one overrides a smaller one, for good."""
 
     RECOVER = auto()  # too few positions: plans fly again once they are back
-    # The vehicle's own velocity was found wrong, and it repeats, or no position came: it cannot check positions.
+    # The vehicle's own velocity was found wrong or has stopped: it cannot check positions that come back.
     VELOCITY_WRONG = auto()
     CONTROLLER_FAILED = auto()  # a controller of another package has failed: no plan again
     POSITIONS_DISTRUSTED = auto()  # no position is believed any more: no plan again
@@ -104,8 +104,10 @@ def request_fallback(fallback: Fallback | None, reason: FallbackReason, at_ns: i
         return fallback
     if reason is FallbackReason.ENVELOPE:
         return Fallback(mode=ControlMode.HOLD, since_ns=at_ns, reason=reason)
-    if fallback is not None and (fallback.mode is ControlMode.BRAKE or fallback.reason is FallbackReason.ENVELOPE):
-        return replace(fallback, reason=reason)
+    if fallback is not None:
+        has_braked = fallback.reason is FallbackReason.ENVELOPE or reason is FallbackReason.VELOCITY_WRONG
+        if fallback.mode is ControlMode.BRAKE or has_braked:
+            return replace(fallback, reason=reason)
     return Fallback(mode=ControlMode.BRAKE, since_ns=at_ns, reason=reason)
 
 

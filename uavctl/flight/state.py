@@ -95,6 +95,7 @@ class FallbackGroup(msgspec.Struct, frozen=True, eq=False):
     flown: Fallback | None = None  # the fallback that flies; None if it does not
     biases: Biases = ()  # recent estimates of the bias
     hold_point_m: Vec3 | None = None  # estimated position at which HOLD began [m]; None in other modes
+    left_hold_ns: int | None = None  # boundary of the first plan after the last HOLD [ns]; None before
     # Whether positions had just jumped, and were not believed again, when the fallback became final
     jump_suspected: bool = False
 

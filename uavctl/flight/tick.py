@@ -124,6 +124,7 @@ def _make_state(
             flown=decided.fallback,
             biases=decided.biases,
             hold_point_m=decided.hold_point_m,
+            left_hold_ns=decided.left_hold_ns,
             jump_suspected=decided.jump_suspected,
         ),
         alarms=reported.alarms,
