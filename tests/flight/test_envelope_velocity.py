@@ -626,6 +626,18 @@ def test_what_positions_came_back_with_and_have_moved_since_is_bounded_in_all(
     assert velocity._find_away(VelocityState(returned=returned), now, [], (), observation) is None
 
 
+@pytest.mark.fault(95)
+def test_positions_that_came_back_beside_the_way_may_move_less_from_it() -> None:
+    """By 0.68 m in 5 s: a drift without a silence may be 0.7 m."""
+    places = ((AT_NS - 5 * SECOND_NS, ZERO, ZERO),)
+    now = (-0.68, 0.0, 0.0)
+    observation = structs.replace(believed((0.0, 0.0, -2.0)), motion=Motion(resumed_ns=places[0][0]))
+    for returned in (None, ([-0.25, 0.0, 0.0], 0.7)):
+        state = VelocityState(places=places, returned=returned)
+        drift, *_ = velocity._find_drift(state, ((AT_NS, now),), np.array([now]), ZERO, observation)
+        assert drift == (None if returned is None else (5.0, [-0.93, 0.0, 0.0]))
+
+
 @pytest.mark.parametrize(("late_s", "found_s"), [(0.2, 0.2), (0.0, 0.0), (-0.1, 0.0), (0.5, 0.3)])
 def test_one_delay_explains_all_places_of_a_frame_that_drifts(late_s: float, found_s: float) -> None:
     """Offsets are a constant, a drift, and the delay times the velocity: o = b + d t - τ v."""
