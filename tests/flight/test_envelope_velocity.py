@@ -620,10 +620,10 @@ def test_what_positions_came_back_with_and_have_moved_since_is_bounded_in_all(
         for resumed_ns in (since_ns, since_ns + 1):
             observation = structs.replace(believed(place_m), motion=Motion(resumed_ns=resumed_ns))
             state = VelocityState(places=places, returned=returned)
-            found = velocity._find_away(state, now, [places[0][1]], places, observation)
+            found = velocity._find_return_drift(state, now, [places[0][1]], places, observation)
             assert (found is not None) == (is_found and resumed_ns == since_ns)
-    assert velocity._find_away(VelocityState(), now, [places[0][1]], places, observation) is None
-    assert velocity._find_away(VelocityState(returned=returned), now, [], (), observation) is None
+    assert velocity._find_return_drift(VelocityState(), now, [places[0][1]], places, observation) is None
+    assert velocity._find_return_drift(VelocityState(returned=returned), now, [], (), observation) is None
 
 
 @pytest.mark.fault(95)

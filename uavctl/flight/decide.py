@@ -56,7 +56,7 @@ COMPARED_NS = CORRECTS_NS + 400_000_000
 RIGHT_AGAIN_NS, BACK_AGAIN_NS = 2_000_000_000, 1_000_000_000
 # Plans after HOLD accelerate no more than this for so long. Positions that came back wrong contradict the vehicle's own
 # velocity once it moves, after half a second: with 3 m/s² it is at 1.5 m/s by then.
-GENTLE_NS, GENTLE_MPS2 = 1_500_000_000, 0.7
+AFTER_HOLD_NS, AFTER_HOLD_MPS2 = 1_500_000_000, 0.7
 # Age of a position up to which inertial data alone, without the vehicle's own velocity, make a new plan: nothing would
 # show that they err. With five positions a second and 60 % of them lost, one in ten is older.
 MAX_UNCONFIRMED_NS = 1_000_000_000
@@ -330,13 +330,13 @@ def _find_input_bounds(bias: Vector, left_hold_ns: int | None, phase: _Phase) ->
     """Find the least and largest input of a plan, bias included; None where they are those of the design."""
     controller = phase.controller
     bounds = _shift_input_bounds(bias, controller)
-    is_new = left_hold_ns is not None and phase.context.boundary_ns - left_hold_ns < GENTLE_NS
+    is_new = left_hold_ns is not None and phase.context.boundary_ns - left_hold_ns < AFTER_HOLD_NS
     if not is_new or controller.input_bounds is None:
         return bounds
     low, high = bounds or controller.input_bounds
     push = np.array(bias) if bias else np.zeros(len(low))
     # |u - d| ≤ 0.7 m/s²
-    return np.maximum(low, push - GENTLE_MPS2), np.minimum(high, push + GENTLE_MPS2)
+    return np.maximum(low, push - AFTER_HOLD_MPS2), np.minimum(high, push + AFTER_HOLD_MPS2)
 
 
 def _shift_input_bounds(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:

@@ -219,9 +219,9 @@ def _find_drift(
     # ō + τ v
     now = place if aligned is None else [o + aligned[0] * v for o, v in zip(place, velocity, strict=True)]
     thens = [before for _, before, _ in places] if aligned is None else aligned[1]
-    away = _find_away(state, now, thens, places, observation)
-    if away is not None:
-        return away, places, aligned
+    returned = _find_return_drift(state, now, thens, places, observation)
+    if returned is not None:
+        return returned, places, aligned
     # No place is further away than the least bound, as a rule: then none needs its own.
     is_any_far = max(map(math.dist, repeat(now), thens), default=0.0) > NEAR_DRIFT_S * parameters.disagreement_mps
     for (since_ns, _, velocity_before), then in zip(places if is_any_far else (), thens, strict=False):
@@ -238,7 +238,7 @@ def _find_drift(
     return None, places, aligned
 
 
-def _find_away(
+def _find_return_drift(
     state: VelocityState,
     now: list[float],
     thens: Sequence[Sequence[float]],
