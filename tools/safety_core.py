@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # The monitors of the vehicle's motion work on one state, and have their tests together.
 ENVELOPE = (
     "tests/flight/test_envelope_velocity.py",
+    "tests/flight/test_velocity_return.py",
     "tests/flight/test_envelope.py",
     "tests/flight/test_envelope_observer.py",
     "tests/flight/test_observer.py",

@@ -570,17 +570,8 @@ def later(watching: MonitorState, by_ns: int) -> MonitorState:
     pairs = (("motion", "sent"), ("motion", "vehicle_path"), ("velocity", "offsets"), ("velocity", "places"))
     rows = {name: moved(at(group, name)) for group, name in pairs}
     change = watching.velocity_change
-    names_of_change = (
-        *(
-            "agreed_ns",
-            "supported_ns",
-            "confirmed_ns",
-            "disagrees_ns",
-            "velocity_wrong_ns",
-            "inertial_wrong_ns",
-            "right_ns",
-        ),
-    )
+    names_of_change: tuple[str, ...] = ("agreed_ns", "supported_ns", "confirmed_ns", "disagrees_ns", "right_ns")
+    names_of_change += ("velocity_wrong_ns", "inertial_wrong_ns")
     change_times: dict[str, Any] = {
         name: getattr(change, name) + by_ns for name in names_of_change if getattr(change, name) is not None
     }

@@ -104,10 +104,10 @@ def test_a_clock_that_goes_back_is_a_restart(young_ms: int) -> None:
 )
 def test_messages_that_become_late_are_no_restart(before_ms: int, boot_ms: int, restarts: bool) -> None:
     link, vehicle = heard(before_ms)
-    told = [
+    found = [
         event for _ in range(3) for event in events(link.receive(vehicle.local_position(boot_ms), NOW + SECOND).items)
     ]
-    assert [event.code for event in told] == ["vehicle-reboot"] * restarts
+    assert [event.code for event in found] == ["vehicle-reboot"] * restarts
 
 
 @pytest.mark.fault(20)

@@ -16,6 +16,7 @@ from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import engaged
 from uavctl.flight.monitors.braking import BrakingState
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
+from uavctl.flight.monitors.motion import Motion, PositionObservation
 from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, read_vehicle_velocity
 from uavctl.flight.monitors.observer import Observer
 from uavctl.flight.monitors.outside import OutsideState
@@ -197,3 +198,9 @@ def offsets(
         "offsets": tuple((AT_NS - ns, (place_m - speed_mps * ns * 1e-9, 0.0, 0.0)) for ns in sorted(spans_ns)[::-1]),
         **known,
     }
+
+
+def believed(place_m: Vec3, parameters: EnvelopeParameters = PARAMETERS) -> PositionObservation:
+    """A position that was believed."""
+    observer = Observer(AT_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
+    return PositionObservation(AT_NS, np.array(place_m), False, False, Motion(), observer, seen(AT_NS), parameters)

@@ -17,6 +17,8 @@ This is the only table from verdicts to actions. Phase 1 acts on those about sin
     prediction        brake                     -                      -                      BRAKE while a plan flies
     frozen            distrust positions        drop (phase 1)         -                      replan; count as lost
     vehicle_velocity  distrust its velocity     -                      -                      brake by the prediction
+    vehicle_velocity  end plans, it grows by    drop since consistent  -                      ENVELOPE
+                      braking
     unengaged         end plans, in a climb or  drop after phase 5     -                      no climb on positions
                       landing
 
