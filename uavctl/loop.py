@@ -322,7 +322,7 @@ class ControlLoop:
         outgoing: list[Outgoing] = []  # what fails in `send` is no failure of the controller
         try:
             handover_output = self._hand_over.update(self._make_handover_input(inputs, output))
-            self._is_landing_due = False
+            self._is_landing_due = self._is_landing_due and not output.land
             answers = tuple(self._match_answers(inputs.commands, output.events, handover_output.events))
             notices += self._record_handover(handover_output, inputs.at_ns)
             self._send_commands(handover_output, output, inputs.at_ns, outgoing.append)
@@ -335,7 +335,11 @@ class ControlLoop:
         return answers
 
     def _run_core(self, inputs: StepInput, notices: list[Event], core_error: str) -> TickOutput:
-        """Run the core for a tick. A core that has failed is not run again; the vehicle that it flew is to land."""
+        """Run the core for a tick. A core that has failed is not run again; the vehicle that it flew is to land.
+
+        Landing is asked for in the next tick: the vehicle's state is too old to send where the core took long.
+        """
+        has_failed = bool(self.account.control_error)
         if core_error:
             notices.append(self._fail_core(core_error, inputs.at_ns))
         if not self.account.control_error:
@@ -347,7 +351,7 @@ class ControlLoop:
                 notices.append(self._fail_core(_describe_error(error), inputs.at_ns))
             else:
                 return output
-        return self._make_failed_output(inputs, land=self._is_landing_due)
+        return self._make_failed_output(inputs, land=self._is_landing_due and has_failed)
 
     def _make_failed_output(self, inputs: StepInput, *, land: bool) -> TickOutput:
         """Make the output of a tick after the core has failed: no setpoint; `land` asks the vehicle to land."""

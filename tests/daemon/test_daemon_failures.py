@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from daemon_rig import SECOND, DaemonRig
+from daemon_rig import SECOND, TICK_NS, DaemonRig
 from loopback_rig import make_loop
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
@@ -155,10 +155,15 @@ def test_88_a_tick_that_fails_ends_control_with_a_landing(autopilot: str, monkey
 def test_102_a_core_without_an_end_ends_control_with_a_landing_and_is_not_run_in_a_replay(
     autopilot: str, error: type[BaseException], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The request reaches the vehicle, although a tick that was interrupted has not heard the vehicle for long."""
     rig = make_rig(autopilot)
+    vehicle = rig.connections["vehicle"]
+    failed_ns: list[int] = []
 
     def fail_core(*given: Any, **more: Any) -> Any:
         if rig.now_ns >= FAIL_S * SECOND:
+            rig.now_ns += 300_000_000
+            failed_ns.append(rig.now_ns)
             raise error
         return run_tick(*given, **more)
 
@@ -166,6 +171,8 @@ def test_102_a_core_without_an_end_ends_control_with_a_landing_and_is_not_run_in
         patch.setattr("uavctl.loop.run_tick", fail_core)
         rig.fly()
     assert has_landed(rig, autopilot) and not count_setpoints_after(rig, FAIL_S)
+    requests_ns = [at_ns for at_ns, name in vehicle.words if name == "COMMAND_LONG" and at_ns >= failed_ns[0]]
+    assert requests_ns[0] <= failed_ns[0] + 2 * TICK_NS
     assert count_codes(rig, EventCode.CONTROL_FAILED) == 1
     check_replay(rig)  # with a core that does not fail
 

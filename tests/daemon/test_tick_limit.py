@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from uavctl.daemon.tick_limit import limit_ticks
+from uavctl.daemon.tick_limit import ENGAGED_LIMIT_S, LIMIT_S, limit_ticks
 from uavctl.errors import TickOverdueError
 
 
@@ -46,6 +46,19 @@ def test_102_an_error_that_is_swallowed_comes_again() -> None:
             caught.append(error)
         loop_for_ever()
     assert len(caught) == 1
+
+
+@pytest.mark.fault(102)
+@pytest.mark.parametrize("is_engaged", [False, True])
+def test_102_a_tick_in_control_has_a_limit_of_its_own(is_engaged: bool) -> None:
+    """The error names the limit that applied."""
+    limits_s = {False: LIMIT_S, True: ENGAGED_LIMIT_S}
+    with (
+        limit_ticks(ENGAGED_LIMIT_S) as limit,
+        pytest.raises(TickOverdueError, match=f"within {limits_s[is_engaged]:g} s"),
+        limit.apply(is_engaged=is_engaged),
+    ):
+        sleep_for_ever()
 
 
 def test_nothing_is_interrupted_between_ticks() -> None:

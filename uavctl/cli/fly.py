@@ -42,7 +42,7 @@ from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.flight_orders import FlightOrders, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.landing_guard import guard_landing
 from uavctl.daemon.lock import lock_vehicle
-from uavctl.daemon.tick_limit import limit_ticks
+from uavctl.daemon.tick_limit import ENGAGED_LIMIT_S, LIMIT_S, limit_ticks
 from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
@@ -176,7 +176,7 @@ def fly_daemon(
                     show_live_line(loop, recorder.status, duration_s, config.daemon.tick_s) as feed,
                     run_services(loop, config, path, recorder.status, listener) as service_functions,
                     record_failure(loop),
-                    limit_ticks() as tick_limit,
+                    limit_ticks(ENGAGED_LIMIT_S if config.smpc.controller else LIMIT_S) as tick_limit,
                     guard_landing(loop, config, connections[VEHICLE], path, print_warning) as guard_functions,
                 ):
                     is_stop_requested = run_daemon(
@@ -195,7 +195,7 @@ def fly_daemon(
                             *service_functions,
                             *garbage_functions,
                         ),
-                        limit_tick=tick_limit.apply,
+                        limit_tick=lambda engaged: tick_limit.apply(is_engaged=engaged),
                         on_events=feed.events.extend,
                     )
                 if is_stop_requested and loop.finished:  # not where the limit of the end broke it off

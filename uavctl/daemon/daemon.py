@@ -57,7 +57,7 @@ def fly(
     stop_limit_s: float,
     give_orders: AfterTick = lambda *_: None,
     after_tick: Sequence[AfterTick] = (),
-    limit_tick: Callable[[], AbstractContextManager[None]] = nullcontext,
+    limit_tick: Callable[[bool], AbstractContextManager[None]] = lambda _: nullcontext(),
     on_events: Callable[[tuple[Event, ...]], None] = lambda _: None,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
@@ -72,7 +72,8 @@ def fly(
             positions; 0 ends without one.
         give_orders: called after each tick; gives the orders of the flight. The hand-over begins if it raises.
         after_tick: services, called in this order after each tick; their errors are reported.
-        limit_tick: context of each tick; interrupts one that does not end.
+        limit_tick: called with whether the vehicle flies the setpoints; returns the context of a tick, which
+            interrupts one that does not end.
         on_events: called with the events for people; must not wait.
         wait_for: sleeps until a deadline or the first arrival; returns the names of connections to read.
         now: the clock [ns].
@@ -106,7 +107,7 @@ class _Flight:
     stop_limit_s: float
     give_orders: AfterTick
     services: Sequence[AfterTick]
-    limit_tick: Callable[[], AbstractContextManager[None]]
+    limit_tick: Callable[[bool], AbstractContextManager[None]]
 
     def __init__(
         self,
@@ -192,9 +193,10 @@ class _Flight:
         if self._is_past_limit(due.at_ns):
             self._is_over = True
             return
-        self._gap_limit.check(due.at_ns, is_in_control=loop.handover_state is HandoverState.ENGAGED)
+        is_engaged = loop.handover_state is HandoverState.ENGAGED
+        self._gap_limit.check(due.at_ns, is_in_control=is_engaged)
         self._withheld = 0
-        with self.limit_tick():
+        with self.limit_tick(is_engaged):
             ticked = loop.tick(due.tick, due.at_ns, self._send, due.missed, stop=self._stop_ns is not None)
         lateness_ns, send_ns = started_ns - due.at_ns, self._now() - due.at_ns
         self._handle_orders(ticked, lateness_ns)
