@@ -1,7 +1,7 @@
 """Many flights in virtual time, judged tick by tick.
 
-`python tools/soak.py --scenario mission --seeds 100`: preset `room` as a quadrotor in gusts, 30 % loss in bursts, 20 to
-120 ms of delay, both autopilots: take-off, four waypoints, landing. No wall may be touched.
+`python tools/soak.py --scenario mission --seeds 100`: presets `room-px4` and `room-ardupilot` as quadrotors in gusts,
+30 % loss in bursts, 20 to 120 ms of delay: take-off, four waypoints, landing. No wall may be touched.
 `python tools/soak.py --hours 100`: random faults. A fallback in the very tick in which the age reaches H, every
 setpoint finite, bounded and slew-limited, no exception, and memory that does not grow.
 `python tools/soak.py --scenario pairs --seeds 500`: two faults at a time, both plants, both autopilots: the true
@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "suppo
 
 from chaos import soak_core
 from soak_faults import FlightBatch, fly_faults  # the tests' own
-from soak_mission import AUTOPILOTS, MISSION, MissionFlight, fly_mission, summary
+from soak_mission import AUTOPILOTS, MissionFlight, fly_mission, prepare_mission, summary
 from soak_pairs import TrueFlight, fly_pair
 from soak_replay import ReplayedFlight, replay_in_process, replay_seed, tally_flights
 from soak_rig import prepare_room
@@ -79,11 +79,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def missions(seeds: Sequence[int], out: Path) -> list[MissionFlight]:
     """Fly missions of both autopilots in this process; those that went wrong again, recorded."""
-    prepared = prepare_room(*MISSION)
-    flights = [fly_mission(prepared, autopilot, seed) for autopilot in AUTOPILOTS for seed in seeds]
-    for flight in flights:
-        if not flight.good:
-            fly_mission(prepared, flight.autopilot, flight.seed, out / f"{flight.autopilot}-{flight.seed}.mcap")
+    flights = []
+    for autopilot in AUTOPILOTS:
+        prepared = prepare_mission(autopilot)
+        for seed in seeds:
+            flights.append(fly_mission(prepared, seed))
+            if not flights[-1].good:
+                fly_mission(prepared, seed, out / f"{autopilot}-{seed}.mcap")
     return flights
 
 

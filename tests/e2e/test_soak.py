@@ -13,7 +13,7 @@ import pytest
 from places import ROOT
 from sim_rig import LAND, SET_MODE, decode
 from soak_faults import FLIGHT_S, draw_world, fly_faults
-from soak_mission import AUTOPILOTS, MISSION, fly_mission, summary
+from soak_mission import AUTOPILOTS, fly_mission, prepare_mission, summary
 from soak_rig import prepare_room
 from soak_take_off import fly_take_off, judge_outcome, tally_take_offs
 from take_off_rig import RELAYED, TakeOffRig
@@ -33,8 +33,7 @@ def faulty_controller() -> Prepared:
 
 @pytest.mark.slow
 def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> None:
-    prepared = prepare_room(*MISSION)
-    flights = [fly_mission(prepared, autopilot, 1) for autopilot in AUTOPILOTS]
+    flights = [fly_mission(prepare_mission(autopilot), 1) for autopilot in AUTOPILOTS]
     for flight in flights:
         assert flight.good, flight
         assert flight.clearance_m > 0.1

@@ -1,4 +1,4 @@
-"""The mission of preset `room`: take-off, four waypoints, landing, in gusts, over a bursty link with delays."""
+"""A mission with the preset of each autopilot: take-off, four waypoints, landing, in gusts, over a bursty link."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from soak_rig import LoopWatch, fly
+from soak_rig import LoopWatch, fly, prepare_room
 
 from sim.simulation import World
 from uavctl.arrays import Array
@@ -159,16 +159,21 @@ def _spread(values: Sequence[float]) -> tuple[float, float]:
     return float(np.sqrt(np.mean(np.square(values)))), max(values)
 
 
-def fly_mission(prepared: Prepared, autopilot: str, seed: int, path: Path | None = None) -> MissionFlight:
+def prepare_mission(autopilot: str) -> Prepared:
+    """Design and controller of the mission with the autopilot's preset."""
+    return prepare_room(*MISSION, preset=f"room-{autopilot}")
+
+
+def fly_mission(prepared: Prepared, seed: int, path: Path | None = None) -> MissionFlight:
     """Fly it once.
 
     Args:
-        prepared: `soak_rig.prepared_for(*MISSION)`; which autopilot and seed it has does not matter to it.
-        autopilot: Whose behaviour the vehicle shows.
+        prepared: `prepare_mission` of the autopilot.
         seed: Of every draw.
         path: Recording; None for none.
     """
-    config = load_config("room-hahn-stursberg", [*MISSION, f"sim.autopilot={autopilot}", f"sim.seed={seed}"])
+    autopilot = prepared.config.sim.autopilot
+    config = load_config(f"room-{autopilot}", [*MISSION, f"sim.seed={seed}"])
     ground = _Ground(prepared)
     worlds: list[World] = []
 

@@ -34,9 +34,9 @@ ALARMS = ("envelope-", "sample-jump", "sample-frozen")
 MOST_FINDINGS = 20  # of one flight: the first ones tell
 
 
-def prepare_room(*overrides: str) -> Prepared:
-    """Design and controller of preset `room`."""
-    config = load_config("room-hahn-stursberg", overrides)
+def prepare_room(*overrides: str, preset: str = "room-hahn-stursberg") -> Prepared:
+    """Design and controller of a preset."""
+    config = load_config(preset, overrides)
     return prepare(config, build_flight_design(config))
 
 
