@@ -58,15 +58,16 @@ class ParameterReader:
 
     def take(self, record: Record) -> None:
         """Take raw bytes from the vehicle, or parameters of an earlier record; other records are ignored."""
-        if isinstance(record, ToldParameter):
-            value = int(record.value) if record.type in _INTEGERS and math.isfinite(record.value) else record.value
-            parameter = VehicleParameter(
-                value=value, type=record.type, system=record.system, component=record.component
-            )
-            self._earlier_values[record.name] = parameter
-            self._count_before = record.count or self._count_before
-        elif isinstance(record, Datagram) and not record.outgoing:
-            self._take_bytes(record)
+        match record:
+            case Datagram(outgoing=False):
+                self._take_bytes(record)
+            case ToldParameter():
+                value = int(record.value) if record.type in _INTEGERS and math.isfinite(record.value) else record.value
+                parameter = VehicleParameter(
+                    value=value, type=record.type, system=record.system, component=record.component
+                )
+                self._earlier_values[record.name] = parameter
+                self._count_before = record.count or self._count_before
 
     def _take_bytes(self, datagram: Datagram) -> None:
         partial, message_id = self._partial_frames.pop(datagram.link, b""), read_single_frame_id(datagram.data)

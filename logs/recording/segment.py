@@ -23,6 +23,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -49,7 +50,7 @@ from logs.recording.topics import HEADER, Definition, get_definition
 from uavctl.config.types import LogConfig
 
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-_MESSAGE_FIELDS = 22  # bytes of a message record besides its data
+_PREFIX_BYTES = 9  # opcode and length of a record, which its length does not count
 _OPCODE = int(Opcode.MESSAGE)
 INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
 COMPRESSION = b"zstd"
@@ -60,7 +61,7 @@ _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of summary, start of i
 ZERO_UTC = "zero_utc_ns"
 
 
-class QueuedMessage(NamedTuple):
+class QueuedMessage(msgspec.Struct, frozen=True):
     """A message on its way to the disk."""
 
     definition: Definition
@@ -69,11 +70,12 @@ class QueuedMessage(NamedTuple):
     data: bytes
 
 
-class _Channel(NamedTuple):
+class _Channel(msgspec.Struct):
     """Channel of a topic."""
 
     number: int
     record: bytes
+    index: list[int] = []  # log time and offset of each of its messages in the open chunk, in turn
 
 
 class Segment:
@@ -90,6 +92,7 @@ class Segment:
         self._compress = ZstdCompressor(level=_LEVEL).compress
         self._zero_utc_ns = zero_utc_ns
         self._channels: dict[str, _Channel] = {}
+        self._open_channels: list[_Channel] = []  # those that the open chunk has messages of
         self._schemas: dict[str, Schema] = {}
         # Of a long recording there are many chunks: what the footer says of them is kept as its bytes.
         self._chunk_indexes = bytearray()
@@ -111,27 +114,25 @@ class Segment:
         Raises:
             OSError: the chunk could not be written; its messages and this one are in `open_entries`.
         """
-        kind, sequence, at_ns, data = entry
-        channel = self._channels.get(kind.topic)
-        index = None if channel is None else self._indexes.get(channel.number)
+        data, entries = entry.data, self.open_entries
+        channel, head = self._channels.get(entry.definition.topic), b""
         if channel is None:
-            channel, head = self._make_channel(kind)
-        else:
-            head = channel.record if index is None else b""
-        size = MESSAGE.size + len(data)
-        entries = self.open_entries
-        full = bool(entries) and self._size + len(head) + size > self._chunk_bytes
+            channel, head = self._make_channel(entry.definition)
+        elif not channel.index:
+            head = channel.record
+        size, offset = MESSAGE.size + len(data), self._size + len(head)
+        full = bool(entries) and offset + size > self._chunk_bytes
         entries.append(entry)
         if full:
             self._commit(entries[:-1])
             self.open_entries = [entry]
-            head, index = head or channel.record, None
-        utc_ns, offset = at_ns + self._zero_utc_ns, self._size + len(head)
-        if index is None:
-            self._indexes[channel.number] = [utc_ns, offset]
-        else:
-            index += (utc_ns, offset)
-        fields = MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel.number, sequence, utc_ns, utc_ns)
+            head = head or channel.record
+            offset = len(head)
+        if head:  # its first message in the chunk
+            self._open_channels.append(channel)
+        utc_ns = entry.at_ns + self._zero_utc_ns
+        channel.index += (utc_ns, offset)
+        fields = MESSAGE.pack(_OPCODE, size - _PREFIX_BYTES, channel.number, entry.sequence, utc_ns, utc_ns)
         self._parts += (head, fields, data)
         self._size = offset + size
 
@@ -214,7 +215,9 @@ class Segment:
     def _begin_chunk(self) -> None:
         self._parts: list[bytes] = []
         self._size = 0
-        self._indexes: dict[int, list[int]] = {}  # channel -> log time, offset, log time, offset ...
+        for channel in self._open_channels:
+            channel.index = []
+        self._open_channels = []
 
     def _make_channel(self, definition: Definition) -> tuple[_Channel, bytes]:
         """Return the channel of a new topic, and the records that must stand before its first message."""
@@ -258,11 +261,12 @@ class Segment:
         start = self.bytes + len(prefix)
         at = start + len(chunk)
         offsets, indexes = {}, []
-        for channel_id, flat in self._indexes.items():
-            offsets[channel_id] = at
+        for channel in self._open_channels:
+            count = len(channel.index)
+            offsets[channel.number] = at
             indexes.append(
-                INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(flat), channel_id, 8 * len(flat))
-                + struct.pack(f"<{len(flat)}Q", *flat)
+                INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * count, channel.number, 8 * count)
+                + struct.pack(f"<{count}Q", *channel.index)
             )
             at += len(indexes[-1])
         block = b"".join([prefix, chunk, *indexes])
@@ -286,7 +290,7 @@ class Segment:
         earlier_times_ns = self._times_ns or (first, last)
         self._times_ns = min(earlier_times_ns[0], first), max(earlier_times_ns[1], last)
         self.messages += len(entries)
-        self._counts.update({channel_id: len(flat) // 2 for channel_id, flat in self._indexes.items()})
+        self._counts.update({channel.number: len(channel.index) // 2 for channel in self._open_channels})
         self._begin_chunk()
 
     def _make_tail(self) -> bytes:
@@ -484,7 +488,8 @@ class Rotation:
         Raises:
             OSError: a chunk could not be written; `fail` keeps what it held, this message included.
         """
-        segment = self._open_segment()
+        segment = self._segment
+        assert segment is not None  # who calls has asked is_open
         entry = QueuedMessage(get_definition(topic), self.written + 1, at_ns, data)
         try:
             segment.add(entry)

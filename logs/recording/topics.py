@@ -137,6 +137,7 @@ def is_known(topic: str) -> bool:
     return topic in _BY_NAME or parse_raw_topic(topic) is not None
 
 
+@lru_cache(maxsize=256)
 def get_record_type(topic: str) -> type[Record]:
     """Return the record type of a topic.
 
@@ -215,8 +216,7 @@ def encode(record: Record) -> bytes:
         return record.data
     try:
         if isinstance(record, Plan):
-            record = round_plan(record)
-        record = _spell_float_fields(record)
+            record = _spell_float_fields(round_plan(record))
         data = _ENCODER.encode(record)
         # msgspec writes every non-finite float as null: without one, all is said.
         if b"null" not in data or not _may_be_non_finite(record):
@@ -236,9 +236,12 @@ def round_plan(plan: Plan) -> Plan:
         return plan
     matrices: list[Array] = [getattr(plan, name) for name in MATRICES]
     values = np.concatenate([matrix.ravel() for matrix in matrices])
-    parts = np.split(_round(values), np.cumsum([matrix.size for matrix in matrices])[:-1])
-    rounded = {name: part.reshape(matrix.shape) for name, part, matrix in zip(MATRICES, parts, matrices, strict=True)}
-    return msgspec.structs.replace(plan, exact_crc32=zlib.crc32(values.tobytes()), **rounded)
+    rounded, end = _round(values), 0
+    parts: dict[str, Array] = {}
+    for name, matrix in zip(MATRICES, matrices, strict=True):
+        begin, end = end, end + matrix.size
+        parts[name] = rounded[begin:end].reshape(matrix.shape)
+    return msgspec.structs.replace(plan, exact_crc32=zlib.crc32(values.tobytes()), **parts)
 
 
 def _round(values: Array) -> Array:
@@ -340,13 +343,13 @@ def _get_exact_bytes(value: object) -> bytes | None:
         return None
 
 
-def _spell_float_fields(record: Record) -> Record:
-    """Return a record whose fields of type float are texts where they are not finite, as the gap of most plans is."""
-    values = {name: getattr(record, name) for name in _list_float_fields(type(record))}
+def _spell_float_fields(plan: Plan) -> Plan:
+    """Return a plan whose fields of type float are texts where they are not finite, as the gap of most plans is."""
+    values = {name: getattr(plan, name) for name in _list_float_fields(Plan)}
     spelled = {
         name: _spell_tree(value) for name, value in values.items() if type(value) is float and not math.isfinite(value)
     }
-    return msgspec.structs.replace(record, **spelled) if spelled else record
+    return msgspec.structs.replace(plan, **spelled) if spelled else plan
 
 
 @cache
