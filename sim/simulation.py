@@ -201,7 +201,7 @@ class Peers:
                 self._faults.run(stop_ns)
                 has_acted = True
             if autopilot_ns is not None and autopilot_ns <= stop_ns:
-                self._outbox.extend((stop_ns, VEHICLE, data) for data in self.autopilot.run(stop_ns))
+                self._outbox += [(stop_ns, VEHICLE, data) for data in self.autopilot.run(stop_ns)]
                 has_acted = True
             if self.cameras.next_ns <= stop_ns:
                 self._capture_position(stop_ns)

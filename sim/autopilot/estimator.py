@@ -177,7 +177,7 @@ class Estimator:
     @property
     def next_ns(self) -> int | None:
         """Time at which the error next moves on [ns]; None while there is none."""
-        return self._step_ns if self.uses_external and not self.uses_gps and self._last_ns is not None else None
+        return self._step_ns if self._last_ns is not None and self.uses_external and not self.uses_gps else None
 
     def run(self, at_ns: int) -> None:
         """Let the error grow, and pass it to the loops that fly."""

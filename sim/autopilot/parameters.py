@@ -130,7 +130,7 @@ RADIO_MODE = 0  # COM_RC_IN_MODE
 SYSTEM_ID_PARAMETER = {"px4": "MAV_SYS_ID", "ardupilot": "SYSID_THISMAV"}
 
 
-class Parameters:
+class Parameters(dict[str, float]):
     """Parameter values of one vehicle, in order of name as they are numbered on the wire.
 
     Args:
@@ -147,16 +147,8 @@ class Parameters:
         if autopilot == "px4" and has_radio:
             self._table["COM_RC_IN_MODE"] = _make_fixed(RADIO_MODE, ParameterType.INT32)
         self._bytewise = autopilot == "px4"
-        self._values = {
-            name: _round_to_type(parameter.value, parameter.kind) for name, parameter in self._table.items()
-        }
+        super().__init__({name: self.get_default(name) for name in self._table})
         self.names = tuple(sorted(self._table))
-
-    def __getitem__(self, name: str) -> float:
-        return self._values[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._values
 
     def get_type(self, name: str) -> ParameterType:
         """Return the type of a parameter."""
@@ -183,12 +175,12 @@ class Parameters:
         """Change a parameter; return False if it does not take the value and stays as it is."""
         is_accepted = self.accepts(name, value)
         if is_accepted:
-            self._values[name] = _round_to_type(value, self._table[name].kind)
+            self[name] = _round_to_type(value, self._table[name].kind)
         return is_accepted
 
     def encode(self, name: str) -> float:
         """Encode a value for PARAM_VALUE: PX4 puts the bytes of an integer into the float, ArduPilot casts."""
-        value = self._values[name]
+        value = self[name]
         if self._bytewise and self.get_type(name) is not ParameterType.REAL32:
             return float(struct.unpack("<f", struct.pack("<i", int(value)))[0])
         return value
@@ -205,7 +197,7 @@ class Parameters:
         crc = 0
         for name in self.names:
             form = "<f" if self.get_type(name) is ParameterType.REAL32 else "<i"
-            value = self._values[name] if form == "<f" else int(self._values[name])
+            value = self[name] if form == "<f" else int(self[name])
             crc = zlib.crc32(name.encode() + struct.pack(form, value), crc)
         return float(struct.unpack("<f", struct.pack("<I", crc))[0])
 

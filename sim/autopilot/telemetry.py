@@ -162,7 +162,7 @@ class Telemetry:
         self.streams = {message_id: makers[message_id] for message_id in self._default_period_ns}
 
     def _find_next_ns(self) -> int | None:
-        return min((due for message_id, due in self._due_ns.items() if self._period_ns[message_id] > 0), default=None)
+        return min([due for message_id, due in self._due_ns.items() if self._period_ns[message_id] > 0], default=None)
 
     def make_due_messages(self, at_ns: int) -> list[Message]:
         """Return the messages that are due."""

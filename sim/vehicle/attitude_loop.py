@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+
+import msgspec
 
 from sim.vehicle.airframe import GRAVITY_MPS2, Airframe
 from sim.vehicle.rigid_body import BodyState, Quaternion
@@ -20,7 +21,7 @@ MAX_YAW_RATE_RPS = math.radians(90.0)
 MIN_UP_MPS2 = 1.0  # smallest upward thrust of a setpoint: keeps its attitude defined
 
 
-class AttitudeSetpoint(NamedTuple):
+class AttitudeSetpoint(msgspec.Struct, frozen=True):
     """Thrust per mass, and the attitude that points it."""
 
     force_mps2: Vec3  # specific force wanted of the rotors, NED

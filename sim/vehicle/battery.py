@@ -40,8 +40,9 @@ class BatteryModel:
     def open_circuit_v(self) -> float:
         """Voltage without load [V], linear between the tenths of the table."""
         table = self._airframe.open_circuit_v
-        table_position = self.remaining * (len(table) - 1)
-        low = min(int(table_position), len(table) - 2)
+        tenths = len(table) - 1
+        table_position = self.remaining * tenths
+        low = min(int(table_position), tenths - 1)
         return table[low] + (table_position - low) * (table[low + 1] - table[low])
 
     @property

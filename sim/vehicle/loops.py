@@ -135,6 +135,8 @@ class Cascade:
         self.yaw_rad = 0.0
         self._step_s = step_s
         self._dead_steps = round(self.tuning.dead_time_s / step_s)
+        self._max_horizontal_mps2 = GRAVITY_MPS2 * math.tan(self.tuning.tilt_limit_rad)
+        self._max_change_mps2 = self.tuning.jerk_mps3 * step_s
         self._steps = 0
         self._pending: deque[_PendingSetpoint] = deque()  # taken, and not acting yet
         self._extrapolated_steps = 0  # for which a position has moved on by itself
@@ -249,11 +251,10 @@ class Cascade:
     def _follow_acceleration(self) -> None:
         """Change the reference acceleration within the jerk limit, and within what the tilt limit can give."""
         north, east, down = self._setpoint
-        max_horizontal = GRAVITY_MPS2 * math.tan(self.tuning.tilt_limit_rad)
+        max_horizontal, max_change = self._max_horizontal_mps2, self._max_change_mps2
         horizontal = math.sqrt(north * north + east * east)
         if horizontal > max_horizontal:
             north, east = north * max_horizontal / horizontal, east * max_horizontal / horizontal
-        max_change = self.tuning.jerk_mps3 * self._step_s
         dn, de, dd = north - self._accel[0], east - self._accel[1], down - self._accel[2]
         horizontal = math.sqrt(dn * dn + de * de)
         if horizontal > max_change:

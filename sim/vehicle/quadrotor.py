@@ -77,7 +77,8 @@ class Quadrotor:
         self._down_accel_mps2 = 0.0  # downward acceleration in the last step
         self._attitude_error_rad: Vec3 | None = None  # of the loops' attitude, about body axes
         hover_rps = airframe.hover_rps
-        self._rotors.speeds_rps = self._rotors.commands_rps = (hover_rps, hover_rps, hover_rps, hover_rps)
+        self._rotors.commands_rps = (hover_rps, hover_rps, hover_rps, hover_rps)
+        self._rotors.set_speeds(self._rotors.commands_rps)
         self.cascade.reset(self._motion)
 
     @property
@@ -136,8 +137,7 @@ class Quadrotor:
         """Acceleration in NED at the last point of the grid [m/s²]; zero on the floor."""
         if self._touched_ns is not None or self._grounded:
             return ZERO
-        wrench = self._rotors.compute_wrench(self._rotors.speeds_rps)
-        motion = self._motion
+        motion, wrench = self._motion, self._rotors.wrench
         return compute_acceleration(self._body, motion.attitude, motion.velocity_mps, wrench, self.wind.velocity_mps)
 
     @property
@@ -166,7 +166,7 @@ class Quadrotor:
         if self._touched_ns is not None or self._grounded:
             return ZERO
         w, x, y, z = self._motion.attitude
-        thrust_mps2 = self._rotors.compute_wrench(self._rotors.speeds_rps).thrust_n / self._airframe.mass_kg
+        thrust_mps2 = self._rotors.wrench.thrust_n / self._airframe.mass_kg
         return (
             -2.0 * (x * z + w * y) * thrust_mps2,
             -2.0 * (y * z - w * x) * thrust_mps2,

@@ -9,6 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
+
 from sim.vehicle.airframe import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Airframe
 from uavctl.records import Vec3
 
@@ -17,7 +19,7 @@ Quaternion = tuple[float, float, float, float]  # w, x, y, z: turns body axes in
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
-class Wrench(NamedTuple):
+class Wrench(msgspec.Struct, frozen=True):
     """Force and torque of the rotors on the body."""
 
     thrust_n: float  # along -down of the body
@@ -138,12 +140,12 @@ def _add_scaled(start: Vec3, slope: Vec3, h: float) -> Vec3:
     return x + h * u, y + h * v, z + h * w
 
 
-def _average_slopes(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
-    """Return the mean slope by the weights of the classical Runge-Kutta method (Simpson's rule)."""
+def _integrate_slopes(start: Vec3, a: Vec3, b: Vec3, c: Vec3, d: Vec3, h: float) -> Vec3:
+    """Return the values after a step, by the weights of the classical Runge-Kutta method (Simpson's rule)."""
     return (
-        (a[0] + 2.0 * (b[0] + c[0]) + d[0]) / 6.0,
-        (a[1] + 2.0 * (b[1] + c[1]) + d[1]) / 6.0,
-        (a[2] + 2.0 * (b[2] + c[2]) + d[2]) / 6.0,
+        start[0] + h * ((a[0] + 2.0 * (b[0] + c[0]) + d[0]) / 6.0),
+        start[1] + h * ((a[1] + 2.0 * (b[1] + c[1]) + d[1]) / 6.0),
+        start[2] + h * ((a[2] + 2.0 * (b[2] + c[2]) + d[2]) / 6.0),
     )
 
 
@@ -193,7 +195,7 @@ def integrate_step(
             position[1] + h * v1[1] + sixth * (a1[1] + a2[1] + a3[1]),
             position[2] + h * v1[2] + sixth * (a1[2] + a2[2] + a3[2]),
         ),
-        _add_scaled(v1, _average_slopes(a1, a2, a3, a4), h),
-        rotate_attitude(attitude, _add_scaled((0.0, 0.0, 0.0), _average_slopes(w1, t2, t3, t4), h)),
-        _add_scaled(w1, _average_slopes(s1, s2, s3, s4), h),
+        _integrate_slopes(v1, a1, a2, a3, a4, h),
+        rotate_attitude(attitude, _integrate_slopes((0.0, 0.0, 0.0), w1, t2, t3, t4, h)),
+        _integrate_slopes(w1, s1, s2, s3, s4, h),
     )

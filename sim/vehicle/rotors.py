@@ -22,6 +22,7 @@ class Rotors:
 
     Attributes:
         speeds_rps: present speeds.
+        wrench: force and torque at these.
         commands_rps: speeds that they tend to.
         thrust_limited: whether the last command gave more or less thrust than was wanted.
         torque_limited: whether the last command gave more or less torque than was wanted.
@@ -34,8 +35,8 @@ class Rotors:
         self._idle_n = airframe.thrust_n_s2 * airframe.idle_rps**2
         self._half_decay = math.exp(-0.5 * step_s / airframe.motor_lag_s)
         self._decay = math.exp(-step_s / airframe.motor_lag_s)
-        self.speeds_rps: RotorValues = STOPPED
         self.commands_rps: RotorValues = STOPPED
+        self.set_speeds(STOPPED)
         self.is_thrust_limited = self.is_torque_limited = False
 
     def compute_wrench(self, speeds_rps: RotorValues) -> Wrench:
@@ -46,12 +47,15 @@ class Rotors:
         torque_nm = lever_m * (f3 + f4 - f1 - f2), lever_m * (f1 + f4 - f2 - f3), self._torque_m * (f1 + f3 - f2 - f4)
         return Wrench(f1 + f2 + f3 + f4, torque_nm, a + b + c + d)
 
+    def set_speeds(self, speeds_rps: RotorValues) -> None:
+        """Let the rotors turn at these speeds."""
+        self.speeds_rps, self.wrench = speeds_rps, self.compute_wrench(speeds_rps)
+
     def step(self) -> tuple[Wrench, Wrench, Wrench]:
         """Move on by one step, exactly; return the wrenches at its start, middle and end."""
-        start = self.speeds_rps
-        middle = self._compute_lagged_speeds(self._half_decay)
-        self.speeds_rps = self._compute_lagged_speeds(self._decay)
-        return self.compute_wrench(start), self.compute_wrench(middle), self.compute_wrench(self.speeds_rps)
+        start, middle = self.wrench, self.compute_wrench(self._compute_lagged_speeds(self._half_decay))
+        self.set_speeds(self._compute_lagged_speeds(self._decay))
+        return start, middle, self.wrench
 
     def _compute_lagged_speeds(self, decay: float) -> RotorValues:
         (a, b, c, d), (p, q, r, s) = self.speeds_rps, self.commands_rps
@@ -85,9 +89,9 @@ class Rotors:
         self.is_thrust_limited = mean_n != 0.25 * thrust_n
         self.is_torque_limited = is_clipped or yaw_n != yaw
         k = self._thrust_n_s2
-        self.commands_rps = (
-            math.sqrt(max(mean_n - roll + pitch + yaw_n, 0.0) / k),
-            math.sqrt(max(mean_n - roll - pitch - yaw_n, 0.0) / k),
-            math.sqrt(max(mean_n + roll - pitch + yaw_n, 0.0) / k),
-            math.sqrt(max(mean_n + roll + pitch - yaw_n, 0.0) / k),
+        self.commands_rps = (  # no thrust is below `min_n`, which is positive
+            math.sqrt((mean_n - roll + pitch + yaw_n) / k),
+            math.sqrt((mean_n - roll - pitch - yaw_n) / k),
+            math.sqrt((mean_n + roll - pitch + yaw_n) / k),
+            math.sqrt((mean_n + roll + pitch - yaw_n) / k),
         )

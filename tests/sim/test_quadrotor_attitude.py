@@ -21,7 +21,8 @@ DRAG_1PS = CRAZYFLIE_2.rotor_drag_kg[0] * HOVER_SUM_RPS / CRAZYFLIE_2.mass_kg  #
 def turn_to(angle: Vec3, seconds: float) -> Array:
     """Rates and attitude after each step of a turn from level, hovering."""
     body, rotors = Body.from_airframe(CRAZYFLIE_2), Rotors(CRAZYFLIE_2, STEP_S)
-    rotors.speeds_rps = rotors.commands_rps = (CRAZYFLIE_2.hover_rps,) * 4
+    rotors.commands_rps = (CRAZYFLIE_2.hover_rps,) * 4
+    rotors.set_speeds(rotors.commands_rps)
     loop = AttitudeLoop(CRAZYFLIE_2, 7.0, STEP_S)
     motion = BodyState((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
     rows = []

@@ -96,7 +96,7 @@ def test_sliding_on_the_floor_ends_as_coulomb_says() -> None:
     idle = replace(CRAZYFLIE_2, idle_rps=1.0, drag_area_m2=(0.0, 0.0, 0.0), rotor_drag_kg=(0.0, 0.0, 0.0))
     one = quadrotor(at=(0.0, 0.0, 0.0), speed=(2.0, 0.0, 0.0), airframe=idle)
     one.accelerate((0.0, 0.0, 100.0))
-    one._rotors.speeds_rps = (1.0, 1.0, 1.0, 1.0)
+    one._rotors.set_speeds((1.0, 1.0, 1.0, 1.0))
     stop_s = 2.0 / (idle.friction * GRAVITY_MPS2)
     run(one, 0.5 * stop_s)
     assert one.velocity_mps[0] == pytest.approx(1.0, abs=0.02)

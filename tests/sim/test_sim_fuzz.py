@@ -26,6 +26,6 @@ def test_twenty_thousand_mutants_each(autopilot: Literal["px4", "ardupilot"]) ->
 
 def test_the_judge_finds_a_planted_bug(monkeypatch: pytest.MonkeyPatch) -> None:
     """A handler that takes what is not a number for a value: found within a few thousand messages."""
-    monkeypatch.setattr(Parameters, "set", lambda self, name, value: self._values.__setitem__(name, value) or True)
+    monkeypatch.setattr(Parameters, "set", lambda self, name, value: self.__setitem__(name, value) or True)
     with pytest.raises((AssertionError, OverflowError, ValueError)):
         Judge("ardupilot", 5).run(20_000)
