@@ -57,18 +57,19 @@ class Inbox:
         messages: list[CommandAck | StatusText] = []
         later_items: deque[tuple[int, ReceivedItem]] = deque()
         for received_ns, item in self._items:
-            if isinstance(item, VehicleStatus):
-                statuses.append(item)
-            elif isinstance(item, VehicleMotion):
-                motion = item
-            elif not isinstance(item, PositionSample | InertialSample):
-                messages.append(item)
-            elif received_ns > at_ns:
-                later_items.append((received_ns, item))
-            elif isinstance(item, InertialSample):
-                inertial.append(item)
-            else:
-                samples.append(item)
+            match item:
+                case VehicleStatus():
+                    statuses.append(item)
+                case VehicleMotion():
+                    motion = item
+                case PositionSample() | InertialSample() if received_ns > at_ns:
+                    later_items.append((received_ns, item))
+                case PositionSample():
+                    samples.append(item)
+                case InertialSample():
+                    inertial.append(item)
+                case _:
+                    messages.append(item)
         orders = tuple(self._orders)
         self._items = later_items
         self._orders.clear()

@@ -202,16 +202,20 @@ class ControlLoop:
         console_events: tuple[Event, ...] = ()
         received = self._links[link].receive(data, at_ns)
         for item in received.items:
-            from_vehicle = from_vehicle or isinstance(item, VehicleStatus)
-            if isinstance(item, Event):
-                self._put("/uavctl/event", at_ns, item)
-                console_events = (*console_events, item) if item.code in CONSOLE_CODES else console_events
-            elif self._uses_inertial or not isinstance(item, InertialSample):
-                self._inbox.add(item, at_ns)
-            if isinstance(item, PositionSample):
-                from_source = received.is_source_settled
-                if self._is_relay_enabled:
-                    self._relay.add_sample(item, received.attitude)
+            match item:
+                case Event():
+                    self._put("/uavctl/event", at_ns, item)
+                    console_events = (*console_events, item) if item.code in CONSOLE_CODES else console_events
+                    continue
+                case VehicleStatus():
+                    from_vehicle = True
+                case InertialSample() if not self._uses_inertial:
+                    continue
+                case PositionSample():
+                    from_source = received.is_source_settled
+                    if self._is_relay_enabled:
+                        self._relay.add_sample(item, received.attitude)
+            self._inbox.add(item, at_ns)
         replies = received.replies
         answers = tuple([self._record_outgoing(link, answer, at_ns) for answer in replies]) if replies else ()
         return Received(answers, from_vehicle, from_source, console_events)

@@ -372,7 +372,7 @@ def test_an_input_acts_when_its_dead_time_is_over_and_counts_ahead_before() -> N
         at_ns = START_NS + tick * TICK_NS
         history, pending_inputs = apply_due_inputs(history, pending_inputs, at_ns)
         history, _, _ = absorb_samples(kalman, history, at_ns, [sample(START_NS)] if tick == 0 else [])
-        ahead = predict_ahead(kalman, history, pending_inputs, at_ns, dead_ns)
+        ahead = predict_ahead(kalman, history, pending_inputs, predict_belief(kalman, history, at_ns), dead_ns)
         mean, cuts = np.zeros(3), [START_NS, *(START_NS + n * TICK_NS + dead_ns for n in range(tick)), at_ns + dead_ns]
         for n, (earlier, later) in enumerate(itertools.pairwise(cuts)):
             moved = expm(drag_lag_generator(DRAG, LAG) * (later - earlier) * 1e-9)
@@ -380,7 +380,8 @@ def test_an_input_acts_when_its_dead_time_is_over_and_counts_ahead_before() -> N
         assert ahead is not None and ahead.at_ns == at_ns + dead_ns
         np.testing.assert_allclose(ahead.mean[:3], mean, rtol=0, atol=1e-11)
         pending_inputs = (*pending_inputs, (at_ns + dead_ns, np.array([u])))
-    past = predict_ahead(kalman, history, pending_inputs, at_ns - 3 * TICK_NS, dead_ns)  # of a boundary that was missed
+    missed = predict_belief(kalman, history, at_ns - 3 * TICK_NS)  # at a boundary that was missed
+    past = predict_ahead(kalman, history, pending_inputs, missed, dead_ns)
     then = predict_belief(kalman, history, at_ns - 20 * MS)
     assert past is not None and then is not None
     np.testing.assert_allclose(past.mean, then.mean, rtol=0, atol=1e-12)

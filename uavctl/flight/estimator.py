@@ -289,12 +289,12 @@ def apply_due_inputs(
 
 
 def predict_ahead(
-    kalman: Kalman, history: FilterHistory, pending_inputs: PendingInputs, at_ns: int, ahead_ns: int
+    kalman: Kalman, history: FilterHistory, pending_inputs: PendingInputs, belief: Belief | None, ahead_ns: int
 ) -> Belief | None:
-    """Predict the belief of `at_ns` (see `predict_belief`) on by `ahead_ns`, with the inputs that were sent."""
-    belief = predict_belief(kalman, history, at_ns)
+    """Predict a belief (see `predict_belief`) on by `ahead_ns`, with the inputs that were sent."""
     if belief is None or not ahead_ns:
         return belief
+    at_ns = belief.at_ns
     u = _find_state(kalman, history, at_ns).input
     acted: list[tuple[int, Array | None]] = []
     for entry in reversed(history.entries):  # of a window, a few are newer

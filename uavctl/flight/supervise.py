@@ -410,11 +410,10 @@ def _judge_answer(state: ControlState, context: TickContext) -> tuple[ExternalSt
 
 def _predict_plan_base(view: FilterView, measured: Measured, context: TickContext) -> Belief | None:
     """Predict the belief that a plan begins with: for the time at which an input that is sent now begins to act."""
-    controller = context.controller
-    if context.at_ns == context.boundary_ns and not controller.dead_ns:
-        return view.belief
-    kalman, pending = controller.kalman, measured.pending_inputs
-    return predict_ahead(kalman, view.history, pending, context.boundary_ns, controller.dead_ns)
+    controller, boundary_ns, belief = context.controller, context.boundary_ns, view.belief
+    if context.at_ns != boundary_ns:
+        belief = predict_belief(controller.kalman, view.history, boundary_ns)
+    return predict_ahead(controller.kalman, view.history, measured.pending_inputs, belief, controller.dead_ns)
 
 
 def _judge_wall(state: ControlState, plan_base: Belief | None, context: TickContext) -> Verdict:
