@@ -158,10 +158,10 @@ def rotate_vector(q: Quaternion, vector: Vec3) -> Vec3 | None:
 
 def normalise_quaternion(q: tuple[float, ...]) -> Quaternion | None:
     """Scale a quaternion to length 1; None if it is no rotation (not finite, or its length is not near 1)."""
-    length = math.sqrt(sum(value * value for value in q))
+    w, x, y, z = q
+    length = math.sqrt(w * w + x * x + y * y + z * z)
     if not abs(length - 1.0) <= _UNIT_TOLERANCE:  # also false for NaN
         return None
-    w, x, y, z = q
     return w / length, x / length, y / length, z / length
 
 
@@ -181,7 +181,9 @@ def quaternion_from_euler(angles_rad: Vec3) -> Quaternion | None:
     """Convert roll, pitch and yaw [rad] (about z, then y, then x) to a quaternion; None if one is not finite."""
     if not all(map(math.isfinite, angles_rad)):
         return None
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in angles_rad)
+    roll, pitch, yaw = angles_rad
+    cr, cp, cy = math.cos(roll / 2), math.cos(pitch / 2), math.cos(yaw / 2)
+    sr, sp, sy = math.sin(roll / 2), math.sin(pitch / 2), math.sin(yaw / 2)
     return (
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,

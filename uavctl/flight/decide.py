@@ -521,7 +521,7 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
     estimate, plant, monitors = supervised.view.estimate, context.controller.plant, supervised.monitors.engaged
     predicted, belief = read_velocity(estimate, plant), supervised.view.belief
     change, bias = monitors.velocity_change, find_lasting_bias(biases)
-    observation, are_lost = observe_velocity(monitors, estimate, context), are_positions_lost(belief, context.at_ns)
+    observation, are_lost = observe_velocity(monitors, belief, context), are_positions_lost(belief, context.at_ns)
     if observation is not None and observation.own_mps is not None:
         own = _select_known(observation.own_mps, plant)
         # It points against the other where v_own' v_predicted < 0

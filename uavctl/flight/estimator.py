@@ -386,9 +386,9 @@ def _find_state(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterSta
 def _compute_state(kalman: Kalman, history: FilterHistory, count: int) -> FilterState:
     """Compute the state of the filter after the first `count` entries, from those that are known."""
     states = history.states
-    while len(states) < count:
+    for entry in history.entries[len(states) : count]:
         before = states[-1] if states else history.anchor
-        states.append(_apply_entry(kalman, history, before, history.entries[len(states)]))
+        states.append(_apply_entry(kalman, history, before, entry))
     return states[count - 1] if count else history.anchor
 
 

@@ -40,7 +40,15 @@ import msgspec
 from msgspec.structs import replace
 
 from uavctl.event_codes import EventCode
-from uavctl.flight.context import FilterView, TickContext, observe_motion, read_position, read_velocity, view_filter
+from uavctl.flight.context import (
+    FilterView,
+    TickContext,
+    expand_axes,
+    observe_motion,
+    read_position,
+    read_velocity,
+    view_filter,
+)
 from uavctl.flight.estimator import (
     FilterHistory,
     distrust_inertial,
@@ -64,7 +72,7 @@ from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.monitors.velocity_change import VelocityChangeState
 from uavctl.flight.monitors.verdict import NO_VERDICT, Verdict, brake, end_plans
 from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
-from uavctl.records import ControlMode, Estimate, Order
+from uavctl.records import ControlMode, Order
 
 # Causes after which no position is believed any more.
 POSITION_CODES = frozenset({EventCode.RESPONSE, EventCode.VELOCITY, EventCode.SCATTER})
@@ -211,7 +219,7 @@ def _judge_estimate(
         is_new = any(read_capture_ns(sample) == belief.inertial.distrusted_ns for sample in measured.samples.accepted)
         is_recent = (view.age_steps or 0) < PLAYED_OUT_STEPS
         compares = returned_ns >= CORRECTS_NS
-        if is_new or (is_recent and (has_drifted or (compares and _is_apart(state, belief, view, context)))):
+        if is_new or (is_recent and (has_drifted or (compares and _is_apart(state, view, context)))):
             return _POSITIONS_CONTRADICTED, NO_VERDICT
     consistent = change.inertial_wrong_ns is None and not has_drifted
     comparison = InertialObservation(ComparedSource.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
@@ -223,10 +231,10 @@ def _has_drifted(state: ControlState, belief: Belief, view: FilterView, context:
     trust = belief.inertial
     if trust.distrusted_ns is not None or trust.used_ns is None or trust.used_ns <= belief.captured_ns:
         return False
-    return _is_apart(state, belief, view, context)
+    return _is_apart(state, view, context)
 
 
-def _is_apart(state: ControlState, belief: Belief, view: FilterView, context: TickContext) -> bool:
+def _is_apart(state: ControlState, view: FilterView, context: TickContext) -> bool:
     """Whether the estimated velocity is apart from the vehicle's own, which inertial data do not contradict."""
     motion, controller = context.inputs.motion, context.controller
     bounds, change = controller.envelope, state.monitors.engaged.velocity_change
@@ -237,27 +245,22 @@ def _is_apart(state: ControlState, belief: Belief, view: FilterView, context: Ti
     if has_jumped or change.disagrees_ns is not None or change.velocity_wrong_ns is not None:
         return False
     # Both at the same time: the vehicle's velocity of a quarter of a second ago does not show how it moves now.
-    then, estimate = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns)), None
-    if then is not None:
-        # A velocity of now needs no other estimate than the tick's.
-        estimate = view.estimate if then is belief else make_estimate(controller.kalman, then, with_cov=False)
-    observation = observe_velocity(state.monitors.engaged, estimate, context)
+    then = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns))
+    observation = observe_velocity(state.monitors.engaged, then, context)
     return observation is not None and not vehicle_velocity.is_inertial_consistent(observation)
 
 
-def observe_velocity(
-    monitors: MonitorState, estimate: Estimate | None, context: TickContext
-) -> VelocityObservation | None:
+def observe_velocity(monitors: MonitorState, belief: Belief | None, context: TickContext) -> VelocityObservation | None:
     """Make the data that the vehicle's own velocity is compared with; None without any."""
-    bounds = context.controller.envelope
-    if bounds is None or estimate is None:
+    bounds, plant = context.controller.envelope, context.controller.plant
+    if bounds is None or belief is None:
         return None
     return VelocityObservation(
         monitors=monitors,
         at_ns=context.at_ns,
         own_mps=read_vehicle_velocity(context.inputs.motion, context.at_ns),
-        predicted_mps=read_velocity(estimate, context.controller.plant, math.nan),
-        age_s=estimate.age_s,
+        predicted_mps=expand_axes(plant, belief.mean.tolist(), plant.velocity_index, math.nan),
+        age_s=(belief.at_ns - belief.captured_ns) * 1e-9,
         parameters=bounds,
     )
 
@@ -323,7 +326,7 @@ def _judge_prediction(monitors: MonitorState, view: FilterView, context: TickCon
     """Compare a prediction without recent positions with the vehicle's own velocity."""
     if (view.age_steps or 0) < PLAYED_OUT_STEPS:
         return NO_VERDICT
-    observation = observe_velocity(monitors, view.estimate, context)
+    observation = observe_velocity(monitors, view.belief, context)
     return NO_VERDICT if observation is None else vehicle_velocity.judge_prediction(observation)
 
 
@@ -369,7 +372,7 @@ def _judge_braking(state: ControlState, view: FilterView, context: TickContext) 
     belief = view.belief
     if context.mode is not ControlMode.BRAKE or belief is None or belief.inertial.distrusted_ns is None:
         return NO_VERDICT
-    observation = observe_velocity(state.monitors.engaged, view.estimate, context)
+    observation = observe_velocity(state.monitors.engaged, view.belief, context)
     if observation is None or not are_positions_lost(belief, context.at_ns):
         return NO_VERDICT
     return vehicle_velocity.judge_braking(observation)

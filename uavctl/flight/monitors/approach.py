@@ -80,7 +80,7 @@ def _learn_winds(
         wind = before if before is not None and at_ns - before[0] <= KNOWN_NS else None
         if count >= LEAST_SAMPLES:
             # V_e = mean of e² - (mean of e)², V_a = mean of a² - (mean of a)²
-            left, squared, shown, shown_squared = (response.recent[first + axis] / count for first in (1, 4, 7, 10))
+            left, squared, shown, shown_squared = [response.recent[first + axis] / count for first in (1, 4, 7, 10)]
             variance = shown_squared - shown * shown
             if variance > SHOWN_MPS2**2 and squared - left * left < LEFT_PART * variance:
                 wind = (at_ns, left)

@@ -174,15 +174,15 @@ def update(
     is_supported = change.agrees(tick.at_ns)
     if by_inertial and not is_supported and not _is_witnessed(observation):
         return state, NO_VERDICT
+    is_urgent = tick.braking and not is_silent
+    bound = NEAR if is_urgent else _compute_bound(tick, observation.parameters)
     evidence, kind = compute_evidence(state, observation.parameters.unexplained_mps2)
     factor = UNCERTAIN
     if by_inertial and not is_silent:
         factor = 1.0 if is_supported else WITNESSED
     if factor == 1.0:
-        onset, onset_kind = compute_onset_evidence(state, observation.parameters)
+        onset, onset_kind = compute_onset_evidence(state, observation.parameters, ONSET * bound)
         evidence, kind = max((evidence, kind), (onset / ONSET, onset_kind))
-    is_urgent = tick.braking and not is_silent
-    bound = NEAR if is_urgent else _compute_bound(tick, observation.parameters)
     if evidence <= factor * bound:
         return state, NO_VERDICT
     text = f"the vehicle does not answer setpoints as they say ({kind}), or a strong wind has set in"
@@ -267,10 +267,15 @@ def compute_evidence(state: ResponseState, unexplained_mps2: float) -> tuple[flo
     return best
 
 
-def compute_onset_evidence(state: ResponseState, parameters: EnvelopeParameters) -> tuple[float, str]:
+def compute_onset_evidence(
+    state: ResponseState, parameters: EnvelopeParameters, bound: float = ONSET * NEAR
+) -> tuple[float, str]:
     """Compute the evidence for the likeliest response that has just become wrong, and its kind.
 
-    It is zero where a right one leaves no more than the least bound: no evidence can be larger.
+    It is zero where a right one leaves no more than `bound`: no evidence can be larger.
+
+    Args:
+        bound: Evidence that has an effect; the least one where that is not known.
     """
     noise_mps2, jump_mps2 = NOISE_PART * parameters.unexplained_mps2, JUMP_PART * parameters.unexplained_mps2
     best, since_ns = (0.0, ""), state.samples[-1][0] - ONSET_NS
@@ -279,7 +284,7 @@ def compute_onset_evidence(state: ResponseState, parameters: EnvelopeParameters)
     first = bisect_right(state.samples, since_ns, key=_TIME)
     recent = _sum_samples([sample for _, sample in state.samples[first:]])
     for group in _GROUPS:
-        if _compute_exact_cost(recent, state.baseline, group, noise_mps2, jump_mps2) > ONSET * NEAR:
+        if _compute_exact_cost(recent, state.baseline, group, noise_mps2, jump_mps2) > bound:
             costs = _compute_costs(state, group, noise_mps2, jump_mps2, since_ns, parameters.lag_s)
             best = max(best, _compare(costs, group))
     return best

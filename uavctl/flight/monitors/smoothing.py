@@ -62,7 +62,7 @@ class SmoothingTrack(msgspec.Struct, frozen=True):
 
     def compute_lag_m(self, at_ns: int) -> Vec3:
         """Compute how far a position of a time is behind [m]."""
-        if not self.flown:
+        if not self.flown or not self.late_s:
             return ZERO
         # τ v_f
         return _scale(self.late_s, _look_up(self.flown, at_ns)[1])
@@ -199,24 +199,23 @@ def _look_up(flown: tuple[_Flown, ...], at_ns: int) -> tuple[Vec3, Vec3, Vec3]:
     if after == len(flown):
         left = math.exp(-s / FILTER_S)
         return velocity, _combine(velocity, 1.0 - left, filtered, left), _combine(distance, 1.0, velocity, s)
-    next_ns, *others = flown[after]
+    next_ns, later_velocity, later_filtered, later_distance = flown[after]
     part = s * 1e9 / (next_ns - last_ns)
-    velocity, filtered, distance = (
-        _combine(before, 1.0 - part, later, part)
-        for before, later in zip((velocity, filtered, distance), others, strict=True)
+    return (
+        _combine(velocity, 1.0 - part, later_velocity, part),
+        _combine(filtered, 1.0 - part, later_filtered, part),
+        _combine(distance, 1.0 - part, later_distance, part),
     )
-    return velocity, filtered, distance
 
 
 def _multiply(a: Sequence[float], b: Sequence[float]) -> float:
-    return sum([x * y for x, y in zip(a, b, strict=True)])
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _scale(factor: float, vector: Vec3) -> Vec3:
-    north, east, down = (factor * value for value in vector)
-    return north, east, down
+    north, east, down = vector
+    return factor * north, factor * east, factor * down
 
 
 def _combine(a: Sequence[float], of_a: float, b: Sequence[float], of_b: float) -> Vec3:
-    north, east, down = (of_a * x + of_b * y for x, y in zip(a, b, strict=True))
-    return north, east, down
+    return of_a * a[0] + of_b * b[0], of_a * a[1] + of_b * b[1], of_a * a[2] + of_b * b[2]
