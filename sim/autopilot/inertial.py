@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass
+from itertools import chain, count
 from typing import NamedTuple
 
 import numpy as np
@@ -83,8 +84,7 @@ ERRORS = {
 def draw_normals(seed: np.random.SeedSequence) -> Iterator[float]:
     """Draw standard normal numbers without end."""
     rng = np.random.default_rng(seed)
-    while True:
-        yield from rng.standard_normal(BATCH_SIZE).tolist()
+    return chain.from_iterable(rng.standard_normal(BATCH_SIZE).tolist() for _ in count())
 
 
 class GaussMarkov:

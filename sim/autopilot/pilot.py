@@ -74,6 +74,7 @@ class Pilot:
         self._profile = profile
         self._vehicle = vehicle
         self._linear_plant = vehicle if isinstance(vehicle, ControlledPlant) else None
+        self._has_down = vehicle.has_down
         self._parameters = parameters
         self._estimator = estimator
         self._boot_ns = boot_ns
@@ -135,7 +136,7 @@ class Pilot:
         """Whether floor or height are watched; the linear plant may fly through the floor."""
         phase = self.phase
         is_above_floor = phase is Phase.CLIMB or phase is Phase.DESCENT
-        return (is_above_floor or (phase is Phase.AIR and self._linear_plant is None)) and self._vehicle.has_down
+        return (is_above_floor or (phase is Phase.AIR and self._linear_plant is None)) and self._has_down
 
     def run(self, at_ns: int) -> None:
         """Act on everything due at `at_ns`, with the vehicle moved there."""
@@ -292,7 +293,7 @@ class Pilot:
                 self._schedule_disarming(at_ns)
             return
         self.phase = Phase.DESCENT if is_landing else Phase.AIR
-        self._phase_end_ns = at_ns + TIMED_PHASE_NS if is_landing and not self._vehicle.has_down else None
+        self._phase_end_ns = at_ns + TIMED_PHASE_NS if is_landing and not self._has_down else None
         self._fly_phase(at_ns)
 
     def _start_climb(self, at_ns: int) -> None:

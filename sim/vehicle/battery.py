@@ -18,6 +18,7 @@ class BatteryModel:
 
     def __init__(self, airframe: Airframe, *, charge: float = 1.0) -> None:
         self._airframe = airframe
+        self._tenths = len(airframe.open_circuit_v) - 1
         self.set_charge(charge)
         self.current_a = 0.0
         self.voltage_v = self.open_circuit_v
@@ -39,8 +40,7 @@ class BatteryModel:
     @property
     def open_circuit_v(self) -> float:
         """Voltage without load [V], linear between the tenths of the table."""
-        table = self._airframe.open_circuit_v
-        tenths = len(table) - 1
+        table, tenths = self._airframe.open_circuit_v, self._tenths
         table_position = self.remaining * tenths
         low = min(int(table_position), tenths - 1)
         return table[low] + (table_position - low) * (table[low + 1] - table[low])

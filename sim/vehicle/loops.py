@@ -226,7 +226,8 @@ class Cascade:
             if self.tuning.is_open_loop:
                 self._set_reference(motion)
                 north, east, down = self._accel
-                return self._compute_attitude((north, east, down - self.tuning.hover_error * GRAVITY_MPS2))
+                accel = north, east, down - self.tuning.hover_error * GRAVITY_MPS2
+                return compute_attitude_setpoint(accel, self.yaw_rad, self.tuning.tilt_limit_rad)
         elif self._demand is LoopDemand.VELOCITY:
             self._follow_velocity(self._setpoint)
         elif self._demand is LoopDemand.LANDING:
@@ -241,9 +242,6 @@ class Cascade:
             return self._track_reference(motion, thrust_limited, down_accel_mps2)
         self._move_reference()
         return self._track_reference(motion, thrust_limited, down_accel_mps2)
-
-    def _compute_attitude(self, accel: Vec3) -> AttitudeSetpoint:
-        return compute_attitude_setpoint(accel, self.yaw_rad, self.tuning.tilt_limit_rad)
 
     def _set_reference(self, motion: BodyState) -> None:
         self._position, self._velocity = motion.position_m, motion.velocity_mps
@@ -309,7 +307,8 @@ class Cascade:
         accel_error = down - down_accel_mps2
         if t.thrust_gain > 0.0:  # a loop on the acceleration gives the thrust for it
             down = t.thrust_gain * accel_error + self._thrust_integral_mps2
-        result = self._compute_attitude((an + t.velocity_1ps * en + jn, ae + t.velocity_1ps * ee + je, down))
+        accel = an + t.velocity_1ps * en + jn, ae + t.velocity_1ps * ee + je, down
+        result = compute_attitude_setpoint(accel, self.yaw_rad, t.tilt_limit_rad)
         if result.is_tilt_limited:
             self._position, self._velocity = (pn, pe, self._position[2]), (vn, ve, self._velocity[2])
         else:
