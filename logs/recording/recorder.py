@@ -390,10 +390,13 @@ class SyncRecorder(_Base):
 class BatchRecorder(SyncRecorder):
     """Recorder of a flight in virtual time: writes `RECORDS` at a time, which takes a tenth off the flight's time."""
 
+    def _begin(self) -> None:
+        self._batch = min(RECORDS, self._log.queue)
+
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """Queue one value under a topic, and write all that wait once they are a batch."""
         _Base.put(self, topic, at_ns, record)
-        if len(self._queue) >= min(RECORDS, self._log.queue):
+        if len(self._queue) >= self._batch:
             self._journal.drain(self._log.queue)
 
 
