@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
 CLIENTS := .venv-clients
 
-.PHONY: fly test test-all test-manual test-clients mutation docs site clean
+.PHONY: fly test test-all test-long test-manual test-clients mutation docs site clean
 
 fly: $(FLIES)
 	$(VENV)/bin/uavctl loopback --udp --config room
@@ -21,6 +21,10 @@ test: $(STAMP)
 
 test-all: $(STAMP)
 	$(VENV)/bin/python tools/check.py --all
+
+# Many whole flights and statistics of thousands of runs: evidence that continuous integration makes anew.
+test-long: $(STAMP)
+	$(VENV)/bin/python tools/check.py --long
 
 # Types the commands of the manual's pages as a reader would, in real time, against simulated vehicles.
 test-manual: $(STAMP)

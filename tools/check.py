@@ -1,7 +1,7 @@
 """All checks of the tree, two side by side, the tests last; the first that fails ends the run.
 
-`make test` runs this, `make test-all` and continuous integration with `--all`; `--write-docs` only writes the generated
-pages.
+`make test` runs this, `make test-all` with `--all`, `make test-long` with `--long`; continuous integration runs the
+last two. `--write-docs` only writes the generated pages.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ BIN = Path(sys.executable).parent
 # Two test processes on two cores; and each of the processes that tests start would compile what it imports anew if no
 # bytecode were kept.
 _PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""}
+# Expressions of pytest's marks, by the option that asks for these tests.
+MARKS = {"": "not slow and not long and not manual", "--all": "not long and not manual", "--long": "long"}
 
 
 class StageError(Exception):
@@ -113,15 +115,14 @@ def check_core() -> str:
     return ""
 
 
-def check_tests(failed: threading.Event, *, everything: bool) -> str:
-    """All tests, or those that are not slow; no test at all is a failure (exit code 5). They end early if `failed`.
+def check_tests(failed: threading.Event, option: str) -> str:
+    """The tests of an option; no test at all is a failure (exit code 5). They end early if `failed`.
 
-    With `everything`, `check_core` runs the safety core's own tests, and they are left out here. A file's tests stay in
+    With `--all`, `check_core` runs the safety core's own tests, and they are left out here. A file's tests stay in
     one process, so that shared parts are made once; tests/conftest.py gives the order.
     """
-    command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-    command += ["-m", "not manual" if everything else "not slow and not manual"]
-    if everything:
+    command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", "-m", MARKS[option]]
+    if option == "--all":
         command += [f"--ignore={test}" for test in list_own_tests()]
     with subprocess.Popen(command, cwd=ROOT, env={**os.environ, **_PROCESSES}) as process:
         while process.poll() is None:
@@ -134,8 +135,11 @@ def check_tests(failed: threading.Event, *, everything: bool) -> str:
     return ""
 
 
-def stages(failed: threading.Event, *, everything: bool) -> tuple[tuple[str, Callable[[], str]], ...]:
-    """All checks: the quickest first, and the types beside the tests, which take longest."""
+def stages(failed: threading.Event, option: str) -> tuple[tuple[str, Callable[[], str]], ...]:
+    """All checks of an option: the quickest first, and the types beside the tests, which take longest."""
+    tests = ("pytest", lambda: check_tests(failed, option))
+    if option == "--long":
+        return (tests,)
     slow = (
         ("wheel, outside the checkout", check_wheel),
         ("site of the manual", check_site),
@@ -146,9 +150,9 @@ def stages(failed: threading.Event, *, everything: bool) -> tuple[tuple[str, Cal
         ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
         ("import contracts", lambda: run([BIN / "lint-imports"])),
         ("generated pages of docs/", check_pages),
-        *(slow if everything else ()),
+        *(slow if option == "--all" else ()),
         ("mypy", lambda: run([BIN / "mypy"])),
-        ("pytest", lambda: check_tests(failed, everything=everything)),
+        tests,
     )
 
 
@@ -167,18 +171,21 @@ def take(name: str, stage: Callable[[], str], failed: threading.Event) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the stages, two at a time; 0 if all of them pass. `--all`: wheel, safety core and slow tests too."""
+    """Run the stages, two at a time; 0 if all of them pass.
+
+    `--all`: wheel, safety core and slow tests too; `--long`: long tests alone.
+    """
     if list(arguments) == ["--write-docs"]:
         for page, text in PAGES.items():
             page.write_text(text(), encoding="utf-8")
         return 0
-    everything = list(arguments) == ["--all"]
-    if arguments and not everything:
-        say("give nothing, --all or --write-docs")
+    option = " ".join(arguments)
+    if option not in MARKS:
+        say("give nothing, --all, --long or --write-docs")
         return 2
     failed = threading.Event()
     with ThreadPoolExecutor(2) as pool:
-        names, checks = zip(*stages(failed, everything=everything), strict=True)
+        names, checks = zip(*stages(failed, option), strict=True)
         list(pool.map(take, names, checks, repeat(failed)))  # read, so that no exception is lost
     return int(failed.is_set())
 

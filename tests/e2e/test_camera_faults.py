@@ -9,7 +9,7 @@ from uavctl.event_codes import EventCode
 from uavctl.flight.supervise import ENVELOPE_CODES
 from uavctl.records import ControlMode
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 # Each kind of fault is flown in one half of the worlds: both autopilots, both plants, and both kinds of preset.
 HALVES = (
     (("room", "px4", "quadrotor"), ("room-ardupilot", "ardupilot", "quadrotor"), ("room", "px4", "linear")),

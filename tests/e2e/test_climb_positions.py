@@ -45,7 +45,7 @@ def fly_to_end(flight: TakeOffRig) -> tuple[float, float]:
     return side_m, height_m
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(66)
 @CASES
 @pytest.mark.parametrize("other_m", [(2.0, 1.5, -0.5), (0.15, 0.1, -0.6), (-1.5, 0.0, -1.2)], ids=["far", "near", "up"])
@@ -60,7 +60,7 @@ def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
     assert side_m < SIDE_M and height_m < CEILING_M
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(66)
 @pytest.mark.parametrize(("autopilot", "after_s"), [("px4", 4.4), ("ardupilot", 3.5)])  # it has just left the ground
 def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for_that(
@@ -81,7 +81,7 @@ def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for
     assert side_m < GOAL[0] + 0.3 and height_m < CEILING_M  # one that takes no harm flies to its goal
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(66)
 @CASES
 @pytest.mark.parametrize("silence", ["sim.camera.frozen", "link.blackout"])
@@ -117,7 +117,7 @@ def fly_with_gps(folder: Path, seed: int, seconds: float, *settings: str) -> tup
     return code, max(beyond)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(42)
 @pytest.mark.parametrize("frame", ["mirrored-north", "mirrored-east", "turned-180", "turned-270"])
 def test_a_wrong_frame_is_found_from_the_first_tick_on_that_flies_on_it(tmp_path: Path, frame: str) -> None:
@@ -126,7 +126,7 @@ def test_a_wrong_frame_is_found_from_the_first_tick_on_that_flies_on_it(tmp_path
     assert code == 1 and beyond_m < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "settings"), [(9523, ()), (25, ("link.loss=0.6", "sim.camera.rate_hz=5.0"))])
 def test_a_healthy_climb_is_not_let_go_for_a_watch_that_began_in_its_midst(
     tmp_path: Path, seed: int, settings: tuple[str, ...]

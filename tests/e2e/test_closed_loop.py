@@ -26,7 +26,7 @@ def paper_flight(seed: int) -> MemorySink:
     return lockstep("paper", 200.0 if seed == LONG else 50.0, f"sim.seed={seed}")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_paper_flies_without_slack() -> None:
     summaries = [summarise(flight(paper_flight(seed)), wall_s=1.0) for seed in SEEDS]
     steps = [summary.steps for summary in summaries]
@@ -39,14 +39,14 @@ def test_paper_flies_without_slack() -> None:
     assert sum(summary.state_violations for summary in summaries) < 0.01 * sum(steps)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_flight_of_200_steps_replays_identically() -> None:
     result = replay(paper_flight(LONG).entries, partial(make_loop, load_config("paper", [f"sim.seed={LONG}"])))
     assert result.identical, result.first_difference
     assert result.decisions == 2000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_paper_costs_what_the_paper_s_example_costs() -> None:
     # 60 runs of 50 steps: 56.2e3 on average (theory, section 7). Twenty runs scatter by a few percent.
     flights = []

@@ -101,7 +101,7 @@ def test_at_a_wall_it_settles_at_the_rest_limit_without_relaxation() -> None:
     assert max(places) < 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_by_default_it_settles_beside_a_wall_as_near_as_the_link_allows() -> None:
     """The promise at the wall itself: 5 % of the steps at most are outside, though some plans need slack."""
     result = lockstep("room", 60.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")

@@ -48,7 +48,7 @@ def test_each_wall_and_the_ceiling_of_each_room_counts(preset: str, place_m: tup
     assert compute_outside_m(load_config(preset), place_m) == pytest.approx(0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(94)
 @pytest.mark.fault(95)
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def fly_lies(seed: int, plant: str, lies: tuple[tuple[str, str, float], ...]) ->
     return fly_deceived(config, believed, controller, deceptions, blackout_s), blackout_s
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(94)
 @pytest.mark.fault(95)
 @pytest.mark.parametrize(("seed", "plant", "lies"), AFTER_ANOTHER)
@@ -81,7 +81,7 @@ def test_lies_one_after_another_and_positions_that_come_back(
     assert flight.outside_m <= OUTSIDE_M and flight.begin_mps > 0.7
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(94)
 @pytest.mark.parametrize(("seed", "kind"), [(30000, "flipped"), (30001, "scaled")])
 def test_lasting_lies_of_inertial_data_alone_do_not_brake_at_every_lost_position(seed: int, kind: str) -> None:
@@ -93,7 +93,7 @@ def test_lasting_lies_of_inertial_data_alone_do_not_brake_at_every_lost_position
     assert flight.outside_m <= OUTSIDE_M
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(94)
 @pytest.mark.parametrize(("seed", "kind", "plant"), HOVERS)
 def test_a_wrong_velocity_accelerates_no_vehicle_that_hovers_before_a_wall(seed: int, kind: str, plant: str) -> None:
@@ -106,7 +106,7 @@ def test_a_wrong_velocity_accelerates_no_vehicle_that_hovers_before_a_wall(seed:
 STAYED = (500, 510, 517)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(42)
 @pytest.mark.parametrize("seed", STAYED)
 def test_positions_that_stay_let_no_vehicle_drift_through_a_wall(seed: int) -> None:

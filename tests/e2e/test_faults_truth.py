@@ -80,7 +80,7 @@ def test_cameras_that_freeze_in_motion_are_no_worse_than_a_blackout(
     assert frozen.ended in ("AUTO.LAND", "LAND", "AUTO.LOITER", "GUIDED")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(14)
 def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: Prepared, start_world: Config) -> None:
     # Two seconds have not passed, so no bias is known.
@@ -88,7 +88,7 @@ def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: 
     assert 0.0 <= assert_bounded(flight).hold_mps2 <= 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(14)
 @pytest.mark.parametrize("seed", [0, 2, 22, 32])
 def test_an_early_freeze_is_no_worse_than_a_blackout_without_vehicle_velocity(prepared: Prepared, seed: int) -> None:
@@ -102,7 +102,7 @@ def test_an_early_freeze_is_no_worse_than_a_blackout_without_vehicle_velocity(pr
     assert assert_bounded(fly_true(prepared, blackout, flight_s=14.0, own_motion=False)).outside_m <= 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(14, 15)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_as_delivered_the_preset_stays_near_the_room_too(
     assert flight.alarms and "LAND" in flight.ended
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(15, 45)
 @pytest.mark.parametrize("axes", IN_THE_AIR)
 def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
@@ -140,7 +140,7 @@ def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
     assert "LAND" in flight.ended
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", AT_ONCE)
 def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
@@ -154,7 +154,7 @@ def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
     assert "LAND" in flight.ended
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", ["turned-90", "mirrored-east"])
 def test_without_vehicle_velocity_positions_against_setpoints_are_enough(
@@ -169,7 +169,7 @@ def test_without_vehicle_velocity_positions_against_setpoints_are_enough(
     assert any("envelope-response" in alarm for alarm in flight.alarms)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(42)
 @pytest.mark.parametrize("speed_mps", [0.1, 0.3])
 @pytest.mark.parametrize("axis", [0, 2])
@@ -194,7 +194,7 @@ def test_positions_that_cannot_be_from_the_start_let_it_land(prepared: Prepared,
     assert "LAND" in flight.ended
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(13)
 def test_another_body_in_motion(prepared: Prepared, start_world: Config) -> None:
     swapped = FaultConfig(at_s=2.0, kind="swapped", for_s=20.0)
@@ -202,7 +202,7 @@ def test_another_body_in_motion(prepared: Prepared, start_world: Config) -> None
     assert flight.moved_m < MOVED_M
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("noise_m", [0.2, 0.7])
 @pytest.mark.fault(42)
 def test_positions_that_scatter(prepared: Prepared, leaning_world: Config, noise_m: float) -> None:
@@ -223,7 +223,7 @@ def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str)
     assert any("envelope-" in alarm for alarm in flight.alarms)
 
 
-@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 12))])
+@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(3, 12))])
 @pytest.mark.fault(44)
 def test_two_faults_at_a_time(prepared: Prepared, seed: int) -> None:
     assert_bounded(fly_pair(prepared, seed))

@@ -20,7 +20,7 @@ WORST = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(105)
 @pytest.mark.usefixtures("control_may_fail")  # after three gaps (row 104)
 @pytest.mark.parametrize(("autopilot", "plant", "seed", "gaps_s"), WORST)

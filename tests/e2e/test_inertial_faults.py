@@ -100,7 +100,7 @@ def measure_excess_m(
     return float(beyond[(times >= blackout_s[0]) & (times <= blackout_s[1])].max()), frozenset(events.codes)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.parametrize(("lie", "seed"), [("frozen", 3), ("step", 11), ("small", 3), ("ramp", 11)])
 @pytest.mark.fault(58)
@@ -115,7 +115,7 @@ def test_an_inertial_error_from_a_blackout_is_found_by_the_vehicle_velocity(
     assert events & {"inertial-doubted", "inertial-silent"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_an_inertial_error_from_the_start_is_found_in_an_early_blackout(autopilot: str) -> None:
@@ -125,7 +125,7 @@ def test_an_inertial_error_from_the_start_is_found_in_an_early_blackout(autopilo
         assert lied_m < 0.1 and "inertial-doubted" in events
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_a_missing_vehicle_velocity_raises_no_inconsistency(autopilot: str) -> None:
@@ -134,7 +134,7 @@ def test_a_missing_vehicle_velocity_raises_no_inconsistency(autopilot: str) -> N
         assert healthy_m < -0.4 and "inertial-doubted" not in events
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_correct_inertial_data_raise_no_inconsistency_and_keep_further_from_walls(autopilot: str) -> None:
     for seed in (3, 11):

@@ -125,7 +125,7 @@ def test_a_good_one_flies_to_the_target(
     assert math.dist(observed.place_m, prepared.config.target.position_m) < 0.15
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("preset", "autopilot", "from_wall_m", "is_corner"),
     [

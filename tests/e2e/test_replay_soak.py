@@ -14,7 +14,7 @@ from logs.recording.reader import find_segments
 SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for below
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> None:
     results = [replay_seed(seed, tmp_path) for seed in SEEDS]
     assert {flight.seed: flight.result.first_difference for flight in results if not flight.is_identical} == {}

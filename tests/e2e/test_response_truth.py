@@ -16,7 +16,7 @@ WORST = (3, 17, 20, 24, 30, 48, 66, 74, 85, 102, 108, 110, 120, 126, 139)
 WORST_LINEAR = (41002, 41008, 41010, 41013, 41015, 41016, 41019)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(101)
 @pytest.mark.parametrize(
     ("seed", "plant"), [*((seed, "quadrotor") for seed in WORST), *((seed, "linear") for seed in WORST_LINEAR)]
@@ -31,7 +31,7 @@ def test_the_true_vehicle_stays_near_the_room(seed: int, plant: str) -> None:
 NORTH, CEILING = ([1.8, 0.0, -1.2], [2.8, 0.0, -1.2]), ([0.0, 0.0, -1.3], [0.0, 0.0, -2.3])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(101)
 @pytest.mark.parametrize(
     ("autopilot", "plant", "way", "dead_s"),

@@ -31,7 +31,7 @@ def faulty_controller() -> Prepared:
     return prepare_room()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> None:
     flights = [fly_mission(prepare_mission(autopilot), 1) for autopilot in AUTOPILOTS]
     for flight in flights:
@@ -57,7 +57,7 @@ def is_setpoint(data: bytes) -> bool:
     return any(message.get_type() == "SET_POSITION_TARGET_LOCAL_NED" for message in decode(data))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_px4_that_receives_no_order_in_the_climb_is_found_hovering(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its positions, and holds its height in AUTO.TAKEOFF."""
     flights: list[TakeOffRig] = []
@@ -96,7 +96,7 @@ def test_an_ardupilot_without_setpoints_hovers_in_any_hand_over_state() -> None:
     assert judge_outcome(flight) == "hovers"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_flights_with_random_faults_have_no_findings(faulty_controller: Prepared) -> None:
     batch = fly_faults(faulty_controller, 0, 0.03, warm_up=1, flight_s=60.0)
     assert not batch.wrong

@@ -12,7 +12,7 @@ from uavctl.event_codes import EventCode
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Event
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 

@@ -123,7 +123,7 @@ def fly_in_wind(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3,
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("autopilot", "push_mps2"),
     [
@@ -160,7 +160,7 @@ CROSSES = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-1.0],[1.5,-1.5,-1.2]]"
 TURN_S = 9.0  # when it turns at the second waypoint
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("autopilot", "push_mps2", "overrides"),
     [
@@ -179,7 +179,7 @@ def test_a_blackout_in_wind_is_flown_through(autopilot: str, push_mps2: Vec3, ov
     assert flight.from_target_m < NEAR_M and flight.furthest_beyond_m < 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.fault(42)
 @pytest.mark.fault(71)

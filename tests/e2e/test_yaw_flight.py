@@ -111,7 +111,7 @@ def test_along_the_path_the_nose_leads_each_leg_and_stays_at_rest(preset: str, a
     assert math.dist(seen.places_m[-1], (1.6, 1.6, -1.2)) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @BOTH
 def test_turning_costs_no_accuracy(preset: str, autopilot: str) -> None:
     held, turning = (

@@ -149,7 +149,7 @@ class _Biased:
         self.flown += steps * ticks
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("estimated", [True, False])
 def test_a_steady_push_leaves_no_offset_from_the_target(estimated: bool) -> None:
     """Preset `room`, without noise; without the estimate the push shows, so the test could fail."""
@@ -164,7 +164,7 @@ def test_a_steady_push_leaves_no_offset_from_the_target(estimated: bool) -> None
     assert np.all(np.abs(world.inputs) <= np.array(config.sets.input_upper))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("share", "most_m"), [(0.6, 0.02), (0.0, math.inf)])
 def test_a_push_within_the_authority_is_flown_against_and_one_at_its_bound_is_told(share: float, most_m: float) -> None:
     """1 m/s of wind at PX4's own simulated vehicle pushes with 1 m/s², half of what may be sent."""

@@ -159,7 +159,7 @@ def test_row_14_rounding_cameras_that_freeze_are_found_once_gusts_must_have_move
     assert 80 < frozen(outputs)[0] <= 80 + 4 * 20  # 4 s
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(14)
 @pytest.mark.parametrize("to_m", [1e-6, 0.001, 0.01])
 @pytest.mark.parametrize("seed", range(3))

@@ -138,7 +138,7 @@ def make_sample(position_m: Array, at_ns: int) -> PositionSample:
     return PositionSample(captured_ns=at_ns, received_ns=at_ns, position_m=place, std_m=0.0, source="", seq=0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("budgets", ["configured", "observed"])
 def test_flights_of_the_simulator_leave_as_often(budgets: str) -> None:
     """At a wall, on a poor link, without inertial data: there the simulator's errors are those of the configuration.

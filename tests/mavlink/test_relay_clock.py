@@ -92,7 +92,7 @@ def assert_they_flow(rig: IndoorsRig, from_s: float, off_s: float) -> None:
 
 @pytest.mark.fault(19)
 @pytest.mark.parametrize(
-    "link", [pytest.param(link, marks=pytest.mark.slow) if link in LIKE_ANOTHER else link for link in LINKS]
+    "link", [pytest.param(link, marks=pytest.mark.long) if link in LIKE_ANOTHER else link for link in LINKS]
 )
 def test_an_ardupilot_gets_its_positions_with_stamps_of_its_clock(link: str) -> None:
     delay, off_s = LINKS[link]
@@ -103,7 +103,7 @@ def test_an_ardupilot_gets_its_positions_with_stamps_of_its_clock(link: str) -> 
     assert_they_flow(rig, 4.0, off_s)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(19)
 @pytest.mark.parametrize(
     ("name", "link", "drift_ppm"),

@@ -57,7 +57,7 @@ def mutants(seed: int, n: int) -> list[bytes]:
     return made
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_damaged_datagrams_neither_raise_nor_change_anything(autopilot: str) -> None:
     one = make_rig(autopilot)
@@ -99,7 +99,7 @@ def any_message(rng: random.Random, client: Client) -> bytes:
     return b"\xfd" + header + payload + crc.to_bytes(2, "little")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_well_formed_messages_with_any_content_never_raise(autopilot: str) -> None:
     rng, client = random.Random(23), Client()

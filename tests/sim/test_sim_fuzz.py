@@ -10,7 +10,7 @@ from fuzz_rig import MAY_CHANGE, Judge
 from sim.autopilot.parameters import Parameters
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_twenty_thousand_mutants_each(autopilot: Literal["px4", "ardupilot"]) -> None:
     """`tools/fuzz.py` sends a million."""

@@ -183,7 +183,7 @@ def rows(campaign_cell: Cell) -> Columns:
     return task.fly()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_promise_is_kept_on_positions_alone_and_only_with_the_filter_s_covariance(tmp_path: Path) -> None:
     """The worst step's interval begins below the 5 % that are allowed, and without P in the margins it does not."""
     columns = rows(cell(tmp_path, 'measured = "position"\n'))

@@ -36,7 +36,7 @@ def config(*overrides: str) -> Config:
     return load_config("paper", overrides)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "base"),
     [("independent", 0), ("late", 0), ("shorter than a step", 0), ("bursts", 30), ("runs as measured", 30)],

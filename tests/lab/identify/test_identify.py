@@ -95,7 +95,7 @@ def test_the_plant_that_made_the_data_is_found_within_its_standard_errors() -> N
     assert np.std(misses) == pytest.approx(1.0, abs=0.7)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [5, 6, 7])
 def test_the_likeliest_dead_time_is_the_one_that_made_the_data(seed: int) -> None:
     flown = (fly(0.1, 0.1, 1.0, seed=seed, dead_ticks=3),)
@@ -135,7 +135,7 @@ def missed(flown: Stretch, fit: AxisFit) -> Array:
     return np.array([np.sqrt(np.mean(ahead.errors_m**2)) for ahead in predict_ahead((flown,), 0, fit)])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_plant_with_a_reference_is_found_and_predicts_another_flight(seed: int) -> None:
     flown, other = (flown_by_reference(seed),), flown_by_reference(20 + seed)

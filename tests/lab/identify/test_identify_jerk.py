@@ -90,7 +90,7 @@ def flown(setpoints: Array, seed: int) -> PositionHistory:
     return PositionHistory(times_s, np.full(len(times_s), 0.03), np.array(rows))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("slew_mps3", [3.5, 5.0])
 def test_the_simulated_ardupilot_is_found_whether_its_jerk_limit_is_exceeded_or_not(slew_mps3: float) -> None:
     """Its velocity under the same setpoints, without noise, is fitted best by lag 0.13 s and drag 0.24 1/s."""

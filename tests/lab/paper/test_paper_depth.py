@@ -51,7 +51,7 @@ def test_without_limits_the_least_cost_is_the_lqg_bound(axis: Design) -> None:
     assert cost == pytest.approx(stationary_bound(axis.plant, axis.q_x, axis.q_u, link), rel=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_limits_cost_and_clipped_lqg_is_not_below_the_least(axis: Design) -> None:
     least_cost = compute_least_settled_cost(axis.plant, axis.input_set, axis.q_x, axis.q_u, 0.3, COARSE)
     assert least_cost == pytest.approx(11.95, abs=0.05)

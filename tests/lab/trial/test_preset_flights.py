@@ -21,7 +21,7 @@ def make_cell(autopilot: AutopilotName, rate_hz: float, loss: float) -> TrialCel
     return TrialCell(pilot, "hold", autopilot, rate_hz, f"{loss}", (f"link.loss={loss}",), "gusts")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("rate_hz", "max_m"), [(20.0, MAX_TRACKING_M), (5.0, MAX_SCARCE_TRACKING_M)])
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_a_figure_of_eight_is_tracked_with_the_preset_as_it_is(
@@ -31,7 +31,7 @@ def test_a_figure_of_eight_is_tracked_with_the_preset_as_it_is(
     assert fly_trial(cell, SEEDS[0], seconds=0.0, from_s=0.0).tracking_m <= max_m
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_a_preset_holds_no_worse_than_the_tuned_loop_where_positions_are_scarce(autopilot: AutopilotName) -> None:
     ours = make_cell(autopilot, 5.0, 0.3)

@@ -130,7 +130,7 @@ def test_a_flight_is_judged_by_the_truth(cell: TrialCell) -> None:
     assert fly_trial(cell, 2, seconds=14.0, from_s=10.0) == result or cell is OWN  # NaN is not itself
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_a_held_position_is_steady_in_calm_air(autopilot: AutopilotName) -> None:
     """The recorded ArduCopter held 3 to 5 mm; the simulated one swung by 50 to 180 mm after the same way."""
@@ -143,7 +143,7 @@ def test_a_held_position_is_steady_in_calm_air(autopilot: AutopilotName) -> None
     assert result.fallback == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_eight_is_tracked_along_its_own_time() -> None:
     result = fly_trial(replace(OWN, scenario="eight", air="calm"), 0, seconds=1.0, from_s=0.0)
     assert 0.0 < result.tracking_m < result.tracking_max_m < 0.6

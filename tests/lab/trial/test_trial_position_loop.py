@@ -144,7 +144,7 @@ def test_without_wind_and_losses_the_position_is_held(autopilot: AutopilotName) 
     assert result.hold_rms_m < 0.03 and result.nearer_s < 12.0 and result.beyond_m < 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @BOTH
 def test_motion_setpoints_are_followed_closer_than_position_setpoints(autopilot: AutopilotName) -> None:
     one = TrialCell(

@@ -104,20 +104,20 @@ def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, s
         return run_command(capsys, *make_arguments(folder, *OURS, "--json"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_leaves_flights_configuration_and_pages(finished_run: Path) -> None:
     for name in (TUNED_FILE, PAGE_FILE, FIT_PAGE_FILE, SETTINGS_FILE):
         assert (finished_run / name).is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_files_of_a_recording_are_read(finished_run: Path) -> None:
     first = finished_run / BEFORE_FOLDER / "flight.mcap"
     assert len(find_segments(first)) > 1
     assert len(FlightData.from_records(read(first), first).steps) > 500  # of 0.05 s
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(finished_run: Path) -> None:
     flown = [
         parse(read_header(finished_run / name / "flight.mcap").config_toml, name).config
@@ -131,7 +131,7 @@ def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(fini
     assert "plant.dead_time_s" in (finished_run / TUNED_FILE).read_text().split("\n\n")[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("no_flight")
 def test_a_run_that_is_done_flies_no_more(finished_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stamp = (finished_run / TUNED_FILE).read_bytes()
@@ -145,7 +145,7 @@ def test_a_run_that_is_done_flies_no_more(finished_run: Path, capsys: pytest.Cap
     assert (finished_run / TUNED_FILE).read_bytes() == stamp
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("no_flight", "identified_before")
 def test_complete_flights_count_without_the_rest(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -214,7 +214,7 @@ def test_ctrl_c_ends_the_flight_and_the_run(
     assert (folder / BEFORE_FOLDER / "flight.mcap").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("identified_before")
 def test_a_recording_takes_the_place_of_the_first_flight(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -272,7 +272,7 @@ def test_without_a_terminal_the_answer_is_no(tmp_path: Path, monkeypatch: pytest
     assert [tune_run.ask_agreement(), tune_run.ask_agreement()] == [False, True]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(
     finished_run: Path, tmp_path: Path
 ) -> None:
@@ -297,7 +297,7 @@ def test_an_incomplete_tuned_configuration_is_not_read(tmp_path: Path) -> None:
         tune_run.read_tuned(file)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("no_flight")
 def test_ctrl_c_outside_a_flight_keeps_finished_steps(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

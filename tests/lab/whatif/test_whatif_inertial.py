@@ -37,7 +37,7 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     assert course.deviation.first_acting_ns is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("case", "change"),
     [(LINEAR, ELSEWHERE), (LINEAR_ARDUPILOT, "cost.input=[3.0, 3.0, 3.0]")],
@@ -58,7 +58,7 @@ def test_on_the_linear_plant_moved_inertial_data_equal_those_of_a_flight(case: C
     assert largest_m(memory, real) < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("case", "change", "target"),
     [

@@ -151,7 +151,7 @@ def test_the_tuner_s_cost_is_the_world_s(scene: Scene) -> None:
     assert _evaluate(case, some, PAPER_START, newest, disturbances)[0] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tuned_gains_beat_all_of_300_random_ones_and_are_the_same_each_time(scene: Scene) -> None:
     case, newest, disturbances = scene
     tuned = tune(case, PAPER_START, newest, disturbances)

@@ -375,7 +375,7 @@ def pilot(case: ControlProblem, loss: float) -> BatchSmpc:
     return BatchSmpc(ConditionedDecider(solver, case.target), case.plant, case.horizon, case.horizon, 0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("loss", "target"), [(0.3, (0.0, 0.0)), (0.3, (0.0, 18.0)), (0.6, (47.0, 18.0)), (0.1, (49.0, 19.0))]
 )
@@ -397,7 +397,7 @@ def test_no_step_is_outside_more_often_than_allowed(loss: float, target: tuple[f
         assert 0.3 * ALLOWED < settled < ALLOWED
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_allowed_risk_is_used_where_the_printed_margin_leaves_it() -> None:
     """On common draws, from the paper's start; a margin tuned to the same violations costs as little as this does."""
     case = problem("paper")

@@ -112,7 +112,7 @@ def test_deviations_with_gusts_have_the_covariances_of_all_pairs_of_steps() -> N
         np.testing.assert_allclose(sigma[t - 1] ** 2 - white[t - 1] ** 2, missing, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("target", [WALL, CORNER])
 @pytest.mark.parametrize("kind", ["0.5", "0.8", "t", "twice"])
 def test_the_loop_keeps_the_promise_under_disturbances_that_no_design_assumes(kind: str, target: str) -> None:
@@ -124,7 +124,7 @@ def test_the_loop_keeps_the_promise_under_disturbances_that_no_design_assumes(ki
         assert shares.mean() - 3.0 * shares.std(ddof=1) / math.sqrt(len(shares)) <= allowed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_the_loop_coloured_disturbances_break_the_promise() -> None:
     solver = make_solver(CORNER)
     late = [fly(solver, "0.8", np.random.default_rng([7, run]), adapts=False)[FIRST:].mean() for run in range(6)]

@@ -163,7 +163,7 @@ def test_levels_and_factors_that_cannot_be_are_refused(solver: ConditionedSolver
         solver.solve(0, solver.problem.target, solver.problem.target, preview)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("axes", [1, 2])
 @pytest.mark.parametrize(
     "name", ["10%", "30%, bursts of 5", "60%", "60%, bursts of 10", "30 % then 60 %", "30 %, 2 steps late"]

@@ -152,7 +152,7 @@ def corner(tmp_path: Path, loss: float, steps: int) -> Cell:
     return made
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("loss", "steps"), [(0.1, 12), (0.8, 32), (0.9, 56)])
 def test_a_corner_uses_at_least_half_of_the_allowed_risk(tmp_path: Path, loss: float, steps: int) -> None:
     """Settled steps outside, by their mean over runs and four of its standard errors; and plans with slack."""

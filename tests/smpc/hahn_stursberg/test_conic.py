@@ -80,7 +80,7 @@ def test_one_axis_has_36_variables_besides_reference_slacks_and_backoffs(paper_d
     assert layout.size == 36 + 2 + 2 * 7 + 7
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_agrees_with_the_printed_problem_on_100_feasible_states_of_an_axis(
     paper_design: Design, paper_solver: ConicSolver
 ) -> None:

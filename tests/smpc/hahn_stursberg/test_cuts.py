@@ -58,7 +58,7 @@ def thinned(cuts: Cuts) -> list[tuple[int, int]]:
     return [(file, size) for i, (file, size) in enumerate(cuts.cut_points()) if i % 5 == 0 or size not in within[file]]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault(52)
 def test_cut_near_the_end_of_every_chunk(cuts: Cuts) -> None:
     assert len(cuts.files) > 1 and len(cuts.chunks) > 8

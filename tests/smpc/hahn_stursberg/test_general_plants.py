@@ -34,7 +34,7 @@ def kron(left: Array, right: Array) -> Array:
     return np.asarray(np.kron(left, right), dtype=np.float64)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMED)
 def test_cost_is_that_of_the_problem_written_down_again_and_every_row_is_kept(name: str) -> None:
     made = case(name)
@@ -44,7 +44,7 @@ def test_cost_is_that_of_the_problem_written_down_again_and_every_row_is_kept(na
     assert {row: margin for row, margin in minimum.items() if margin < -1e-6} == {}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", PRINTED)
 def test_cost_is_that_of_the_printed_problem(name: str) -> None:
     made = case(name)

@@ -272,7 +272,7 @@ def test_no_age_is_more_frequent_than_by_design(overrides: list[str], phase: flo
     assert promised[6] < 0.5 * build_delayed_link(one_a_step).outage(6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.8])
 @pytest.mark.parametrize("overrides", CAMERAS)
 def test_younger_positions_than_by_design_use_no_more_risk(overrides: list[str], phase: float) -> None:

@@ -113,7 +113,7 @@ def keeps(design: Design, i: int, theta: Array) -> bool:
     return bool(np.linalg.eigvalsh(values)[0] >= -1e-9 * np.linalg.norm(part.sigma_xi, 2))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_no_feasible_policy_costs_less_than_the_cut(name: str) -> None:
     """No policy within half the distance between the limits of every row costs less than the frozen one."""

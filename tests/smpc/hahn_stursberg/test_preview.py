@@ -310,7 +310,7 @@ def extremes(
         yield x, Preview(limits=limits)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("count", "farthest"), [(250, 100.0), (50, 1e4)])
 def test_extreme_states_and_limits_have_an_answer(count: int, farthest: float) -> None:
     design, solver = paper_case()

@@ -69,7 +69,7 @@ def never_costs_more(kind: Kind, less: list[Answer], more: list[Answer]) -> None
 # --- back-offs --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_backoffs_grow_with_the_age_of_the_information(kind: Kind) -> None:
     """Until the first feedback the state is known from stage 0 alone: its age is the stage."""
     for answer in answers(kind, paper_spec(), states(5, 1)):
@@ -96,7 +96,7 @@ def test_backoffs_grow_with_the_age_of_the_base() -> None:
             assert np.all(older > newer)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_backoffs_grow_with_loss(kind: Kind) -> None:
     points = states(4, 3, 0.5)
     worse = [answers(kind, paper_spec(link=bernoulli(np.array([1.0 - loss]))), points) for loss in (0.1, 0.2, 0.3)]
@@ -113,7 +113,7 @@ def test_backoffs_grow_with_loss(kind: Kind) -> None:
 # --- cost -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_better_link_never_costs_more_with_the_same_delays(kind: Kind) -> None:
     points = states(6, 4)
     costs = [answers(kind, paper_spec(link=bernoulli(np.array([p]))), points) for p in (0.99, 0.9, 0.8, 0.7)]
@@ -121,7 +121,7 @@ def test_a_better_link_never_costs_more_with_the_same_delays(kind: Kind) -> None
         never_costs_more(kind, better, worse)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_better_link_never_costs_more_with_the_best_schedule() -> None:
     """Every schedule that a link admits, a better one admits too."""
     point = np.array([[5.0, -1.0, -3.0, 1.0]])
@@ -137,7 +137,7 @@ def test_a_better_link_never_costs_more_with_the_best_schedule() -> None:
     assert costs[0] < costs[-1] * (1.0 - 1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_more_disturbance_never_costs_less(kind: Kind) -> None:
     points = states(6, 5)
     sizes = [np.diag([0.3, 0.3]), np.diag([0.3, 0.6]), np.diag([0.6, 0.6]), np.diag([0.75, 0.6])]
@@ -146,7 +146,7 @@ def test_more_disturbance_never_costs_less(kind: Kind) -> None:
         never_costs_more(kind, less, more)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["state", "input"])
 def test_wider_limits_never_cost_more(kind: Kind, which: str) -> None:
     points = states(6, 6)
@@ -163,7 +163,7 @@ def test_wider_limits_never_cost_more(kind: Kind, which: str) -> None:
         never_costs_more(kind, wide, narrow)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_longer_delays_never_cost_less(kind: Kind) -> None:
     """On a link without losses, where the delays change what is fed back and no likelihood."""
     points = states(5, 7)
@@ -176,7 +176,7 @@ def test_longer_delays_never_cost_less(kind: Kind) -> None:
 # --- symmetries -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mirrored_states_give_mirrored_plans(kind: Kind) -> None:
     solver = kind.make(make_design(paper_spec(state_set=SYMMETRIC)))
     for x in states(6, 8):
@@ -186,7 +186,7 @@ def test_mirrored_states_give_mirrored_plans(kind: Kind) -> None:
         assert item.cost == pytest.approx(other.cost, rel=kind.cost)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_axes_of_the_same_kind_may_be_swapped(kind: Kind) -> None:
     solver = kind.make(make_design(paper_spec(state_set=Polytope.from_box([-30.0, -8.0] * 2, [30.0, 8.0] * 2))))
     swap = [2, 3, 0, 1]
@@ -196,7 +196,7 @@ def test_axes_of_the_same_kind_may_be_swapped(kind: Kind) -> None:
         assert item.cost == pytest.approx(other.cost, rel=kind.cost)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("move_m", [(100.0, 0.0), (-3.0, 2000.0), (1e5, -1e5)], ids=str)
 def test_a_shift_of_everything_shifts_the_plan(kind: Kind, move_m: tuple[float, float]) -> None:
     move = np.array([move_m[0], 0.0, move_m[1], 0.0])
@@ -220,7 +220,7 @@ def test_the_step_s_number_changes_nothing(kind: Kind) -> None:
     assert (item.seq, other.seq, item.cost) == (0, 12345, other.cost)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("units", [(1e3, 1.0, 1.0), (1.0, 1e-3, 1.0), (1.0, 1.0, 1e6), (0.3048, 1e3, 1e-4)], ids=str)
 def test_a_change_of_units_changes_nothing(kind: Kind, units: tuple[float, float, float]) -> None:
     spec, changed = paper_spec(), Units.of(paper_plant(), *units)
@@ -237,7 +237,7 @@ def test_a_change_of_units_changes_nothing(kind: Kind, units: tuple[float, float
 # --- coupling ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_hardly_coupled_axes_have_the_plan_of_independent_ones(kind: Kind) -> None:
     """One component of two axes, whose coupling does nothing, against two components."""
     joint = make_design(paper_spec(plant=paper_plant(coupling=1e-10)))

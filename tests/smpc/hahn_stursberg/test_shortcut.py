@@ -81,7 +81,7 @@ def test_near_the_target_it_is_nearly_always_accepted(name: str) -> None:
     assert methods.count("frozen") == 50
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_a_refused_frozen_policy_costs_more_than_the_optimum(name: str) -> None:
     """Without the KKT test wrong answers would pass."""
@@ -206,7 +206,7 @@ def test_same_question_same_bits_after_any_other_questions() -> None:
 # --- what cannot be met ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_every_question_has_an_answer_and_relaxed_constraints_are_named(name: str) -> None:
     tested = case(name)

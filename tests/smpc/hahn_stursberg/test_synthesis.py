@@ -130,7 +130,7 @@ def test_gradient_is_that_of_finite_differences(seed: int, discount: float) -> N
         assert gradient[index] == pytest.approx(numeric, rel=1e-6, abs=1e-6 * np.abs(gradient).max())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("tau", [1, 2, 5])
 def test_no_gain_of_a_grid_is_better(tau: int) -> None:
     plant, q_x, q_u = one_axis(paper_plant()), np.diag([10.0, 0.1]), np.array([[0.1]])
