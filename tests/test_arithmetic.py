@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,7 @@ print(json.dumps([ARITHMETIC, np._core._multiarray_umath.__cpu_features__["X86_V
 BITS = ["0x1.9c270292bbc66p+11", "-0x1.1c5a6293b5a10p-9", "-0x1.69518ce56c5e9p+8", "0x1.0112a7b047a0bp+12"]
 
 
+@cache
 def computed(first: str) -> tuple[str, bool, list[str]]:
     environ = {name: value for name, value in os.environ.items() if name not in (CORE, CHOICE)}
     made = subprocess.run(

@@ -56,7 +56,7 @@ def test_a_name_that_is_none_is_refused_as_of_any_module() -> None:
         _ = uavctl.slove  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", ["sim.py", "logs/__init__.py"])
+@pytest.mark.parametrize("name", ["sim.py", pytest.param("logs/__init__.py", marks=pytest.mark.slow)])
 def test_a_module_of_the_same_name_that_hides_ours_is_reported(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
@@ -230,7 +230,9 @@ def read_messages(path: Path) -> list[tuple[str, int, bytes]]:
     return [message for message in results if message[0] not in _MEASURED]
 
 
-@pytest.mark.parametrize(("name", "more"), [("paper", PAPER), ("room", {"link.loss": 0.4})])
+@pytest.mark.parametrize(
+    ("name", "more"), [pytest.param("paper", PAPER, marks=pytest.mark.slow), ("room", {"link.loss": 0.4})]
+)
 def test_a_flight_records_the_bytes_that_the_command_line_records(
     name: str, more: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_page: None
 ) -> None:
@@ -372,6 +374,7 @@ def test_a_flight_that_breaks_off_leaves_a_whole_recording(
     assert end["cause"] == ("still flying" if error is KeyboardInterrupt else "the controller has failed")
 
 
+@pytest.mark.slow
 def test_a_flight_may_begin_on_the_ground_as_the_command_line_s_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], no_page: None
 ) -> None:

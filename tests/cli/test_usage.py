@@ -148,6 +148,7 @@ def find_extra_modules() -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_without_any_extra_every_command_loads_and_every_refusal_works(tmp_path: Path) -> None:
     result = find_extra_modules()
     assert {"pyarrow", "pandas", "polars", "distributed", "natnet", "qtm_rt", "pyulog"} <= result

@@ -41,6 +41,7 @@ def test_a_flight_arrives_on_plans_of_the_scheme(flight: MemorySink) -> None:
     assert np.linalg.norm(np.array(flight.of(Truth)[-1].position_m) - target) < 0.2
 
 
+@pytest.mark.slow
 def test_without_inertial_data_the_setpoints_play_the_plans_out() -> None:
     """What is decided at a boundary is the plan's input of that step.
 
@@ -74,6 +75,7 @@ def test_what_is_planned_has_arrived_by_the_end_of_its_step() -> None:
     assert moving > 2
 
 
+@pytest.mark.slow
 def test_a_flight_replays_bit_for_bit() -> None:
     config = load_config("room", ["duration_s=12.0", "sim.seed=4"])
     assert replay(lockstep("room", 12.0, "sim.seed=4").entries, lambda sink: make_loop(config, sink)).identical
@@ -191,13 +193,14 @@ def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
 
 
 def test_design_shows_the_risk_of_each_age(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["design", "--config", "paper", "--set", SCHEME, "--json"]) == 0
+    command = ["design", "--config", "paper", "--set", SCHEME, "--rehearsals", "0"]
+    assert main([*command, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["scheme"] == METHOD
     weights = np.array(document["weights"])
     for budgets in (document["budgets"], document["budgets_in_transit"]):
         assert weights @ np.array(budgets) + document["beyond"] == pytest.approx(0.05)
-    assert main(["design", "--config", "paper", "--set", SCHEME]) == 0
+    assert main(command) == 0
     assert "upper limit of east position" in capsys.readouterr().out
 
 

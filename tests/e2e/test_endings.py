@@ -220,6 +220,7 @@ def test_no_heartbeat_is_received(tmp_path: Path, run_flight: RunFlight) -> None
     run_flight(rig, Cause.NO_VEHICLE, *TAKE_OFF)
 
 
+@pytest.mark.slow
 def test_a_second_vehicle_is_received(tmp_path: Path, run_flight: RunFlight) -> None:
     second = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
     beat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 4 << 16 | 3 << 24, 3, 3).pack(second))
@@ -229,6 +230,7 @@ def test_a_second_vehicle_is_received(tmp_path: Path, run_flight: RunFlight) -> 
     run_flight(rig, Cause.SECOND_VEHICLE, *TAKE_OFF)
 
 
+@pytest.mark.slow
 def test_the_vehicle_is_in_the_air_already(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, airborne=True)
     rig.switch_mode("POSCTL")

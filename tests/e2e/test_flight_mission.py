@@ -159,6 +159,7 @@ def test_a_trajectory_is_followed_far_closer_than_by_chasing_its_samples() -> No
     assert {decision.waypoint for decision, _ in middle(circling)} == {None}
 
 
+@pytest.mark.slow
 def test_a_fence_that_closes_in_slowly_is_kept_by_every_plan() -> None:
     memory = fly_mission(22.0, *FENCE)
     data = flight(memory)

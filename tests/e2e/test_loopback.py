@@ -92,6 +92,7 @@ def test_replay_is_identical_and_info_counts(flown: Path, capsys: pytest.Capture
     assert topics["/sim/truth"] == 12 and topics["/raw/vehicle/out"] > 120
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_replay_with_another_cost_decides_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_document(capsys, "loopback", "--config", "paper", "--duration", "4", "--out", str(tmp_path / "f"))
@@ -198,6 +199,7 @@ def test_a_flight_without_its_page_has_a_complete_summary(
     assert "no room" in output.err
 
 
+@pytest.mark.slow
 def test_what_flies_loads_nothing_that_draws() -> None:
     names = "uavctl.cli.fly, uavctl.cli.loopback, uavctl.cli.ctl"
     script = f"import sys, {names}; print([name for name in sys.modules if name in ('matplotlib', 'jinja2')])"

@@ -103,6 +103,7 @@ def test_one_that_fails_brakes_within_the_room_and_replays(
     assert assert_replay(path, capsys)
 
 
+@pytest.mark.usefixtures("no_page")
 def test_what_one_prints_is_no_part_of_the_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ("loopback", "--config", "room", "--duration", "2", "--set", f"smpc.controller={MODULE}:Prints")
     assert run([*command, "--out", str(tmp_path / "one"), "--json"]) == 0

@@ -131,7 +131,7 @@ def test_the_pilot_s_stick_ends_streaming_and_is_never_argued_with(autopilot: st
 
 
 @pytest.mark.fault(28)
-@BOTH
+@pytest.mark.parametrize("autopilot", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 def test_the_vehicle_s_own_failsafe_has_precedence(autopilot: str) -> None:
     flight = TakeOffRig(autopilot, "sim.plant=quadrotor").take_off().run(7.0)
     pilot = flight.peers.autopilot.pilot

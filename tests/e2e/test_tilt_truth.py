@@ -45,7 +45,10 @@ def fly_corners(preset: str, autopilot: str, *keys: str) -> Seen:
     ("preset", "autopilot", "keys"),
     [
         ("room-px4", "px4", ()),
-        ("room-ardupilot", "ardupilot", ("sets.input_lower=[-3.5,-3.5,-1.5]", "sets.input_upper=[3.5,3.5,1.5]")),
+        pytest.param(
+            *("room-ardupilot", "ardupilot", ("sets.input_lower=[-3.5,-3.5,-1.5]", "sets.input_upper=[3.5,3.5,1.5]")),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_vehicle_leans_no_further_than_told_and_arrives(preset: str, autopilot: str, keys: tuple[str, ...]) -> None:

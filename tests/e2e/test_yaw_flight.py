@@ -73,7 +73,9 @@ def assert_undisturbed(seen: Seen) -> None:
     assert (seen.alarms, seen.wrong) == (set(), ())
 
 
-@BOTH
+@pytest.mark.parametrize(
+    ("preset", "autopilot"), [("room-px4", "px4"), pytest.param("room-ardupilot", "ardupilot", marks=pytest.mark.slow)]
+)
 def test_a_given_angle_is_flown_at_a_limited_rate_and_replays(
     preset: str, autopilot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -125,7 +125,7 @@ WINDS = {
 }
 
 
-@pytest.mark.parametrize("drag_1ps", [0.24, 1.0])
+@pytest.mark.parametrize("drag_1ps", [0.24, pytest.param(1.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wind", WINDS)
 @pytest.mark.fault(71)
 def test_a_wind_that_inertial_data_show_is_no_false_position(wind: str, drag_1ps: float) -> None:
@@ -151,7 +151,7 @@ def test_a_strong_push_is_told_with_its_size_and_a_weak_one_is_not() -> None:
     np.testing.assert_allclose(held.watching.motion.push_mps2, (3.0, 0.0, 0.0), atol=0.3)
 
 
-@pytest.mark.parametrize("wind", ["calm", "north", "gusts"])
+@pytest.mark.parametrize("wind", ["calm", "north", pytest.param("gusts", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("from_s", [0.0, 4.0])
 @pytest.mark.parametrize(
     "frame",

@@ -210,6 +210,7 @@ def receive_position(recipe: Recipe, url: str) -> list[float]:
     return [float(value) for value in place.strip("()\n").split(",")]
 
 
+@pytest.mark.slow
 def test_a_position_source_is_a_class(tmp_path: Path) -> None:
     recipe, commands, touched = run_recipe("A position source", tmp_path)
     assert (touched, commands) == (0, [])

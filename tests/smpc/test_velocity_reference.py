@@ -284,6 +284,6 @@ def test_its_keys_have_no_effect_on_an_acceleration_plant() -> None:
 
 def test_a_design_of_it_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     arguments = [part for item in (*OVERRIDES, "smpc.scheme=age-conditioned") for part in ("--set", item)]
-    assert main(["design", "--config", "room-hahn-stursberg", "--json", *arguments]) == 0
+    assert main(["design", "--config", "room-hahn-stursberg", "--rehearsals", "0", "--json", *arguments]) == 0
     result = json.loads(capsys.readouterr().out)
     assert len(result["rests"]) == 2 * 3 * STATES_PER_AXIS

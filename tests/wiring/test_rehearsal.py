@@ -91,6 +91,7 @@ def fly_eight_error_m(config: Config, drag_1ps: float) -> float:
     return float(compute_distances_m(np.array(watched.positions_m)[flies], wanted).mean())
 
 
+@pytest.mark.slow
 def test_the_cost_of_an_unidentified_drag_is_rehearsed_and_flown() -> None:
     # With lighter positions than the preset's a drag is undone late.
     light = f"cost.state={[10.0, 1.0, 0.1] * 3}"

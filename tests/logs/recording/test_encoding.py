@@ -83,7 +83,8 @@ def make_plan(rows: Matrix) -> Plan:
     )
 
 
-NUMBERS = st.floats(allow_nan=False, allow_infinity=False).filter(lambda one: one == 0.0 or 1e-9 < abs(one) < 1e15)
+SIZES = st.floats(1e-9, 1e15)
+NUMBERS = st.one_of(st.sampled_from([0.0, -0.0]), SIZES, SIZES.map(lambda size: -size))
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=4))

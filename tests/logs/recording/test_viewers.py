@@ -43,7 +43,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with omit_pages():
         assert (
             run(
-                ["loopback", "--udp", "--config", "room-hahn-stursberg", "--duration", "8", "--out", str(out), "--json"]
+                ["loopback", "--udp", "--config", "room-hahn-stursberg", "--duration", "6", "--out", str(out), "--json"]
             )
             == 0
         )

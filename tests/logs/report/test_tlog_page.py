@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import lzma
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import view_rig
 from places import DATA
 from pymavlink import mavutil  # type: ignore[attr-defined]
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from report_rig import walk_html
+from report_rig import omit_figures, walk_html
 
 from logs.recording.mavlink_flight import MavlinkFlight, read_flight
 from logs.recording.tlog import export_tlog
@@ -53,6 +54,13 @@ def copter(tmp_path_factory: pytest.TempPathFactory) -> Path:
     packed = DATA / "flights" / "arducopter-gps-guided-accel.tlog.xz"
     path.write_bytes(lzma.decompress(packed.read_bytes()))
     return path
+
+
+@pytest.fixture
+def no_figures() -> Iterator[None]:
+    """For pages whose figures nobody looks at."""
+    with omit_figures():
+        yield
 
 
 def test_the_path_is_that_of_the_flight(flight: MavlinkFlight) -> None:
@@ -169,6 +177,7 @@ def test_what_is_none_is_refused(tmp_path: Path, data: bytes, capsys: pytest.Cap
     assert not (tmp_path / "a.html").exists() and str(path) in capsys.readouterr().err.replace("\n", "")
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_torn_one_is_shown_up_to_there(tmp_path: Path, exported: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.tlog"
     path.write_bytes(exported.read_bytes()[: exported.stat().st_size // 2])
@@ -219,6 +228,7 @@ def flown_with(
         ({"armed": False}, "mind", "not-armed"),
     ],
 )  # fmt: skip
+@pytest.mark.usefixtures("no_figures")
 def test_the_main_thing_comes_first(
     given: dict[str, Any], tone: str, cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

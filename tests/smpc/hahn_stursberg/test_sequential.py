@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -139,13 +138,18 @@ def test_gains_and_means_keep_every_constraint_of_the_full_problem(name: str) ->
     assert count >= 5
 
 
-def refused_states(name: str) -> Iterator[Array]:
+@cache
+def refused_states() -> tuple[Array, ...]:
     """States from which the frozen policy is not optimal, and sequential quadratic programming answers."""
-    design, rng = design_of(name), np.random.default_rng(103)
-    for _ in range(60):
-        x = uniform(design, rng)
-        if solver(name).solve(0, x, design.target).method == "sequential":
-            yield x
+    design, rng = design_of("paper"), np.random.default_rng(103)
+    drawn = [uniform(design, rng) for _ in range(60)]
+    return tuple(x for x in drawn if solver("paper").solve(0, x, design.target).method == "sequential")
+
+
+@cache
+def exact_answers() -> tuple[Answer, ...]:
+    """The exact program's answers from the refused states."""
+    return tuple(exact_solver("paper").solve(0, x, design_of("paper").target) for x in refused_states())
 
 
 @pytest.mark.parametrize(
@@ -159,13 +163,13 @@ def refused_states(name: str) -> Iterator[Array]:
 )
 def test_a_wrong_solution_has_no_proof(constant: str, value: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors of the method cost answers, and make none wrong."""
-    states, design = list(refused_states("paper")), design_of("paper")
+    states, exact, design = refused_states(), exact_answers(), design_of("paper")
     monkeypatch.setattr(sequential, constant, value)
     wrong = ShortcutSolver(design, sequential=True)
     answers = [wrong.solve(0, x, design.target) for x in states]
     assert sum(answer.method == "sequential" for answer in answers) < 0.5 * len(states)
-    for x, answer in zip(states, answers, strict=True):
-        assert_same_optimum(answer, exact_solver("paper").solve(0, x, design.target))
+    for answer, expected in zip(answers, exact, strict=True):
+        assert_same_optimum(answer, expected)
 
 
 def test_the_optimum_of_another_cost_has_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +181,7 @@ def test_the_optimum_of_another_cost_has_no_proof(monkeypatch: pytest.MonkeyPatc
     ) -> tuple[Array, Array] | None:
         return solve(program, h, 1.01 * f, a, upper, lower)
 
-    states, design = list(refused_states("paper")), design_of("paper")
+    states, design = refused_states(), design_of("paper")
     assert states
     monkeypatch.setattr(QuadraticProgram, "solve_with_matrices", solve_another)
     assert all(solver("paper").solve(0, x, design.target).method != "sequential" for x in states)
