@@ -24,9 +24,11 @@ from safety_core import find_missing_branches, list_own_tests
 from docs import PAGES, ROOT
 
 BIN = Path(sys.executable).parent
-# Two test processes on two cores; and each of the processes that tests start would compile what it imports anew if no
+# One thread of each test process; and each of the processes that tests start would compile what it imports anew if no
 # bytecode were kept.
 _PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""}
+# Test processes on two cores: some tests of the first two options fly in real time, and wait.
+PROCESSES = {"": 3, "--all": 3, "--long": 2}
 # Expressions of pytest's marks, by the option that asks for these tests.
 MARKS = {"": "not slow and not long and not manual", "--all": "not long and not manual", "--long": "long"}
 
@@ -121,7 +123,8 @@ def check_tests(failed: threading.Event, option: str) -> str:
     With `--all`, `check_core` runs the safety core's own tests, and they are left out here. A file's tests stay in
     one process, so that shared parts are made once; tests/conftest.py gives the order.
     """
-    command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", "-m", MARKS[option]]
+    command = [str(BIN / "pytest"), "-n", str(PROCESSES[option]), "-m", MARKS[option]]
+    command += ["--dist", "loadfile", "--no-loadscope-reorder"]
     if option == "--all":
         command += [f"--ignore={test}" for test in list_own_tests()]
     with subprocess.Popen(command, cwd=ROOT, env={**os.environ, **_PROCESSES}) as process:
