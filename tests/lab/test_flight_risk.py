@@ -199,5 +199,5 @@ def test_a_number_of_flights_or_a_seed_that_is_none_is_refused(
 
 
 def test_flights_that_leave_are_noted_and_refuse_nothing() -> None:
-    items = {item.name: item for item in make_flight_items(make_adrift(30))}
+    items = {item.name: item for item in make_flight_items(make_adrift(12))}
     assert (items["flight"].state, items["flight"].ok) == ("note", True)

@@ -82,6 +82,7 @@ def test_another_cost_is_recorded_reported_and_replays(
 
 
 @pytest.mark.usefixtures("no_figures")
+@pytest.mark.usefixtures("no_figures")
 def test_the_terminal_shows_the_validity_before_the_figures(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

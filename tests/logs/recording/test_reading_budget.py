@@ -6,6 +6,7 @@ import json
 import struct
 import zlib
 from collections.abc import Callable
+from functools import partial
 from itertools import count, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -338,10 +339,16 @@ def test_whatever_a_definition_says_the_steps_are_few(
 # --- ULog ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("data", [hostile.make_nested_ulog(2000, 1000), hostile.make_subscribing_ulog(20_000)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(hostile.make_nested_ulog, 2000, 1000),
+        pytest.param(partial(hostile.make_subscribing_ulog, 20_000), marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.fault(96)
-def test_formats_are_not_spelled_out_beyond_any_log(data: bytes, tmp_path: Path) -> None:
-    path = put(tmp_path, data, "flight.ulg")
+def test_formats_are_not_spelled_out_beyond_any_log(make: Callable[[], bytes], tmp_path: Path) -> None:
+    path = put(tmp_path, make(), "flight.ulg")
     with (
         limit_calls(2_000_000),
         limit_memory(2**26),

@@ -143,7 +143,7 @@ def test_each_file_is_on_the_disk_before_the_next_is_begun(tmp_path: Path) -> No
 
 @pytest.mark.fault(29)
 def test_29_disk_full_at_every_operation_loses_nothing_when_files_change(tmp_path: Path) -> None:
-    items = flight(120)
+    items = flight(80)
     number = 0
     while True:
         path = tmp_path / f"at{number}" / "flight.mcap"
