@@ -318,8 +318,8 @@ def find_keys(name: str) -> tuple[str, ...]:
     """
 
     def list_keys(section: type[Section], path: str) -> Iterator[str]:
-        for field in msgspec.structs.fields(section):
-            key = f"{path}{field.encode_name}"
+        for part, field in _find_fields(section).items():
+            key = f"{path}{part}"
             if is_section(field.type):
                 yield from list_keys(field.type, f"{key}.")
             elif get_element_type(field.type) is None:
