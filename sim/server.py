@@ -16,10 +16,10 @@ from selectors import EVENT_READ, SelectSelector
 from sim.autopilot.profile import SIMULATED
 from sim.natnet import SCHEME, NatNetPort, make_motive_config
 from sim.ports import Port, open_port
-from sim.simulation import MOCAP, VEHICLE, Peers, VehicleSnapshot
+from sim.simulation import MOCAP, VEHICLE, Peers, SharedSpace, VehicleSnapshot
 from uavctl.config.types import Config
 from uavctl.errors import ConnectionSpecError
-from uavctl.records import Truth
+from uavctl.records import ClosestApproach, Collision, Truth
 
 PortWrapper = Callable[[str, Port], Port]
 """Wraps the port of a connection, which is named `vehicle` or `mocap`."""
@@ -42,6 +42,15 @@ class Ready:
 def compute_grid_start_ns(now_ns: int, dt_ns: int) -> int:
     """Return the next multiple of Δt on CLOCK_MONOTONIC [ns]: two processes share this grid without communication."""
     return -(-now_ns // dt_ns) * dt_ns
+
+
+@dataclass(frozen=True)
+class Encounters:
+    """Encounters of the vehicles of a run; none if there was one vehicle."""
+
+    start_ns: int  # when time began
+    collisions: tuple[Collision, ...]  # in order of time
+    closest_approaches: tuple[ClosestApproach, ...]  # one a pair
 
 
 @dataclass(frozen=True)
@@ -81,8 +90,10 @@ def serve_all(
     speed: float = 1.0,
     on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None = None,
     wrap_port: PortWrapper | None = None,
-) -> None:
-    """Run the peers of each setup until `stop()` or the end of the duration.
+) -> Encounters:
+    """Run the peers of each setup until `stop()` or the end of the duration; return how the vehicles met.
+
+    All vehicles are in one space: they collide, and feel each other's downwash.
 
     Virtual time catches up after a delay. At a speed beyond this computer's, it runs as fast as possible.
 
@@ -98,6 +109,7 @@ def serve_all(
 
     Raises:
         ConnectionSpecError: a URL is not understood or cannot be opened.
+        ConfigError: vehicles touch at the start.
     """
     opened_ports: list[dict[str, Port]] = []
     try:
@@ -116,10 +128,14 @@ def serve_all(
         dt_ns = math.lcm(*(round(setup.config.plant.dt_s * 1e9) for setup in setups))
         clock = _Clock(compute_grid_start_ns(time.monotonic_ns(), dt_ns), speed)
         end_ns = None if duration_s is None else clock.start_ns + round(duration_s * 1e9)
-        worlds = [_make_world(setup, ports, clock, airborne) for setup, ports in zip(setups, opened_ports, strict=True)]
+        space = SharedSpace(
+            [setup.config for setup in setups],
+            [_make_peers(setup, ports, clock, airborne) for setup, ports in zip(setups, opened_ports, strict=True)],
+        )
         for ports in opened_ports:
             on_ready(Ready(ports[VEHICLE].url, ports.get(MOCAP, ports[VEHICLE]).url, clock.start_ns))
-        _run_worlds(worlds, clock, end_ns, stop, on_snapshot)
+        _run_space(space, opened_ports, clock, end_ns, stop, on_snapshot)
+        return Encounters(clock.start_ns, space.collisions, space.closest_approaches)
     finally:
         for ports in opened_ports:
             for port in ports.values():
@@ -141,10 +157,7 @@ class _Clock:
         return max(0, until_ns - self.now_ns()) * 1e-9 / self.speed
 
 
-_World = tuple[Peers, dict[str, Port]]
-
-
-def _make_world(setup: VehicleSetup, ports: dict[str, Port], clock: _Clock, airborne: bool) -> _World:
+def _make_peers(setup: VehicleSetup, ports: dict[str, Port], clock: _Clock, airborne: bool) -> Peers:
     shared = setup.mocap == setup.vehicle
     config, cameras = setup.config, ports.get(MOCAP)
     if isinstance(cameras, NatNetPort):
@@ -152,49 +165,52 @@ def _make_world(setup: VehicleSetup, ports: dict[str, Port], clock: _Clock, airb
     peers = Peers(config, clock.start_ns, airborne=airborne, shared_link=shared, on_truth=setup.on_truth)
     if isinstance(cameras, NatNetPort):
         cameras.clock_us = lambda: peers.cameras.clock_us(clock.now_ns())
-    return peers, ports
+    return peers
 
 
-def _run_worlds(
-    worlds: Sequence[_World],
+def _run_space(
+    space: SharedSpace,
+    opened_ports: Sequence[dict[str, Port]],
     clock: _Clock,
     end_ns: int | None,
     stop: Callable[[], bool],
     on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None,
 ) -> None:
-    sockets = [port for _, ports in worlds for port in ports.values()]
+    sockets = [port for ports in opened_ports for port in ports.values()]
     last_ns = None if end_ns is None else end_ns - 1  # events at the end itself are not sent
     snapshot_s = time.monotonic()  # time of the next snapshot
 
-    def compute_goal_ns(peers: Peers) -> int:
+    def compute_goal_ns(reached_ns: int) -> int:
         now_ns = clock.now_ns() if last_ns is None else min(clock.now_ns(), last_ns)
-        return min(now_ns, peers.now_ns + MAX_STEP_NS)
+        return min(now_ns, reached_ns + MAX_STEP_NS)
 
     while not stop():
         if on_snapshot is not None and time.monotonic() >= snapshot_s:
-            on_snapshot(tuple(peers.take_snapshot() for peers, _ in worlds))
+            on_snapshot(tuple(peers.take_snapshot() for peers in space.peers))
             snapshot_s = time.monotonic() + SNAPSHOT_PERIOD_S
-        for peers, ports in worlds:
-            to_ns = compute_goal_ns(peers)
-            if to_ns >= peers.now_ns:  # else the start of the grid is still to come
-                for _, link, data in peers.advance(to_ns):
+        reached_ns = max(peers.now_ns for peers in space.peers)
+        to_ns = compute_goal_ns(reached_ns)
+        if to_ns >= reached_ns:  # else the start of the grid is still to come
+            for ports, due in zip(opened_ports, space.advance(to_ns), strict=True):
+                for _, link, data in due:
                     ports[link].write(data)
-        if last_ns is not None and all(peers.now_ns >= last_ns for peers, _ in worlds):
+        if last_ns is not None and all(peers.now_ns >= last_ns for peers in space.peers):
             break
-        until_ns = min(peers.next_ns for peers, _ in worlds)
+        until_ns = min(peers.next_ns for peers in space.peers)
         if last_ns is not None:
             until_ns = min(until_ns, last_ns)
         _wait(sockets, min(clock.compute_remaining_s(until_ns), MAX_SLEEP_S))
-        for peers, ports in worlds:
+        for peers, ports in zip(space.peers, opened_ports, strict=True):
             for link, port in ports.items():
                 for data in port.read():
-                    at_ns = compute_goal_ns(peers)
+                    at_ns = compute_goal_ns(peers.now_ns)
                     if at_ns >= peers.now_ns:
+                        space.interact(at_ns)
                         peers.receive(link, data, at_ns)
-    for peers, _ in worlds:
+    for peers in space.peers:
         peers.flush()
     if on_snapshot is not None:
-        on_snapshot(tuple(peers.take_snapshot() for peers, _ in worlds))
+        on_snapshot(tuple(peers.take_snapshot() for peers in space.peers))
 
 
 def _wait(ports: Sequence[Port], max_s: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,10 @@ from sim.faults import Faults, find_active_faults, merge_fault_spans
 from sim.vehicle.linear import LinearVehicle, make_linear_model
 from sim.vehicle.quadrotor import STEP_S, Quadrotor
 from sim.wind import Wind
+from sim.world import Interactions, OnCollision, WorldBody
 from uavctl.config.types import Config
-from uavctl.records import Flyer, Received, Send, Truth, Vec3
+from uavctl.errors import ConfigError
+from uavctl.records import ClosestApproach, Collision, Flyer, Received, Send, Truth, Vec3
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class VehicleSnapshot:
 
 VEHICLE, MOCAP = "vehicle", "mocap"
 Due = tuple[int, str, bytes]  # (at_ns, link, datagram)
+Handler = Callable[[str, bytes, int], Received]  # of a datagram: link, bytes and time
 
 
 class Peers:
@@ -91,13 +94,13 @@ class Peers:
     @property
     def next_ns(self) -> int:
         """Time of the next event [ns]: a datagram to send, a sample, or an act of the vehicle."""
-        times = [self._next_action_ns, self._truth_ns + 1, self.channel.next_ns]
+        times = [self.next_action_ns, self._truth_ns + 1, self.channel.next_ns]
         if self._outbox:
             times.append(self._outbox[0][0])
         return min(at_ns for at_ns in times if at_ns is not None)
 
     @property
-    def _next_action_ns(self) -> int:
+    def next_action_ns(self) -> int:
         """Time at which cameras, autopilot or a fault act next [ns]."""
         return self._find_next_action_ns(self.autopilot.next_ns, self._faults.next_ns)
 
@@ -107,7 +110,7 @@ class Peers:
 
     def advance(self, to_ns: int) -> list[Due]:
         """Move time on; return the datagrams due up to and including `to_ns`, in order of time."""
-        self._run_events(to_ns)
+        self.run_events(to_ns)
         return self._take_due(to_ns)
 
     def _take_due(self, to_ns: int) -> list[Due]:
@@ -116,22 +119,26 @@ class Peers:
         due.sort(key=lambda datagram: datagram[0])  # stable: the vehicle first
         return due
 
-    def exchange(self, to_ns: int, handle: Callable[[str, bytes, int], Received]) -> None:
-        """Advance time and pass on every datagram in order of time; the peers receive answers at the reached time.
+    def exchange_next(self, to_ns: int, handle: Handler) -> int:
+        """Advance to the next event, at most to `to_ns`, and pass on every datagram in order of time; return that time.
 
-        Time stops only at events of the peers: more stops would change the rounding of their motion.
+        The peers receive answers at the reached time. Time stops only at events of the peers: more stops would change
+        the rounding of their motion.
         """
-        while True:
-            at_ns = self._run_next_events(to_ns)
-            for arrival_ns, link, data in self._take_due(at_ns):
-                for answer in handle(link, data, arrival_ns).answers:
-                    self.receive(answer.link, answer.data, at_ns)
-            if at_ns >= to_ns:
-                return
+        at_ns = self._run_next_events(to_ns)
+        for arrival_ns, link, data in self._take_due(at_ns):
+            for answer in handle(link, data, arrival_ns).answers:
+                self.receive(answer.link, answer.data, at_ns)
+        return at_ns
+
+    def exchange(self, to_ns: int, handle: Handler) -> None:
+        """Advance time and pass on every datagram in order of time; see `exchange_next`."""
+        while self.exchange_next(to_ns, handle) < to_ns:
+            pass
 
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         """Take one datagram of the controller at `at_ns`; the cameras take none."""
-        self._run_events(at_ns)
+        self.run_events(at_ns)
         if link == VEHICLE and not is_within(self._config.link.uplink_blackout, at_ns - self._start_ns):
             self._outbox.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
 
@@ -155,8 +162,10 @@ class Peers:
 
     @property
     def _active_faults(self) -> tuple[str, ...]:
-        """Kinds of the faults that act now; a random occlusion is one too."""
+        """Kinds of the faults that act now; a random occlusion and a past collision are such too."""
         faults = find_active_faults(self._config, self.now_ns - self._start_ns)
+        if self.vehicle.is_wrecked:
+            faults = (*faults, "collision")
         return (*faults, "occluded") if self.cameras.is_occluded and "occluded" not in faults else faults
 
     def take_snapshot(self) -> VehicleSnapshot:
@@ -185,7 +194,8 @@ class Peers:
         if self._truth_ns == self.now_ns:
             self._report_truth()
 
-    def _run_events(self, to_ns: int) -> None:
+    def run_events(self, to_ns: int) -> None:
+        """Move time on; what is sent until then waits."""
         while self._run_next_events(to_ns) < to_ns:
             pass
 
@@ -244,20 +254,165 @@ def make_quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) 
     )
 
 
-class World:
-    """Flight of `flyer` against the simulated peers; bit-identical for a seed.
+class SharedSpace:
+    """Peers of vehicles in one space: time moves on for all of them, and they act on each other as `Interactions` says.
 
-    In each tick of the grid start_ns + n tick_s the flyer first gets every datagram that has arrived by
-    then, then decides, and what it sends reaches the peers at the same instant. So a sample taken at a boundary
-    and not delayed is known to that boundary's decision. Its answer to a datagram reaches the vehicle at the
-    time of that datagram, or with the peers' next event.
+    Their events are run in order of time, those of one time by the vehicle's number. A vehicle alone is left to itself.
+
+    Raises:
+        ConfigError: vehicles touch at the start.
+    """
+
+    def __init__(
+        self, configs: Sequence[Config], peers: Sequence[Peers], on_collision: OnCollision | None = None
+    ) -> None:
+        self.peers = tuple(peers)
+        self._interactions = None
+        if len(peers) > 1:
+            bodies = [
+                WorldBody(config.sim.system_id, one.vehicle, config.sim.radius_m, config.sim.downwash)
+                for config, one in zip(configs, peers, strict=True)
+            ]
+            self._interactions = Interactions(bodies, peers[0].now_ns, on_collision)
+
+    @property
+    def collisions(self) -> tuple[Collision, ...]:
+        """All collisions so far, in order of time."""
+        return () if self._interactions is None else tuple(self._interactions.collisions)
+
+    @property
+    def closest_approaches(self) -> tuple[ClosestApproach, ...]:
+        """Least distance of each pair so far."""
+        return () if self._interactions is None else self._interactions.closest_approaches
+
+    def exchange(self, to_ns: int, handlers: Sequence[Handler]) -> None:
+        """Advance time and pass on every datagram to its vehicle's handler; see `Peers.exchange_next`."""
+        self._interact(to_ns, lambda at_ns: self._exchange_events(at_ns, handlers))
+        self._exchange_events(to_ns, handlers)
+
+    def advance(self, to_ns: int) -> list[list[Due]]:
+        """Move time on; return the datagrams of each vehicle due up to and including `to_ns`, in order of time."""
+        self.interact(to_ns)
+        return [peers.advance(to_ns) for peers in self.peers]
+
+    def interact(self, to_ns: int) -> None:
+        """Move time on to the last interaction up to and including `to_ns`; what is sent until then waits."""
+        self._interact(to_ns, self._run_events)
+
+    def _interact(self, to_ns: int, advance: Callable[[int], None]) -> None:
+        interactions = self._interactions
+        while interactions is not None and interactions.next_ns <= to_ns:
+            advance(interactions.next_ns)
+            interactions.run()
+
+    def _run_events(self, to_ns: int) -> None:
+        for peers in self.peers:
+            peers.run_events(to_ns)
+
+    def _exchange_events(self, to_ns: int, handlers: Sequence[Handler]) -> None:
+        waiting = {number: peers.next_action_ns for number, peers in enumerate(self.peers)}
+        while waiting:
+            number = min(waiting, key=lambda each: (min(waiting[each], to_ns), each))
+            if self.peers[number].exchange_next(to_ns, handlers[number]) >= to_ns:
+                del waiting[number]
+            else:
+                waiting[number] = self.peers[number].next_action_ns
+
+
+@dataclass(frozen=True)
+class Seat:
+    """A vehicle of a world in lockstep: its configuration, what flies it, and the receiver of its truth."""
+
+    config: Config
+    flyer: Flyer
+    on_truth: Callable[[Truth], None] | None = None
+
+
+class FleetWorld:
+    """Flights of several vehicles in one space, each by its own flyer; bit-identical for their seeds.
+
+    In each tick of the grid start_ns + n tick_s each flyer first gets every datagram that has arrived by
+    then; then they decide, in order of their number, and what they send reaches their peers at the same instant. So a
+    sample taken at a boundary and not delayed is known to that boundary's decision. The answer to a datagram reaches
+    the vehicle at the time of that datagram, or with the peers' next event.
 
     Args:
-        config: the whole configuration; `sim`, `link`, `plant`, `frame` and the tick are used.
-        on_truth: gets the `Truth` of every Δt boundary, see `Peers`.
+        seats: the vehicles; of a configuration `sim`, `link`, `plant`, `frame` and the tick are used. All have the
+            same tick and Δt.
         on_progress: gets the seconds flown so far, after every Δt.
+        on_collision: gets every collision.
         start_ns: time of tick 0.
-        airborne: whether the vehicle begins in the air, armed and in its external mode; else on the floor, disarmed.
+        airborne: whether the vehicles begin in the air, armed and in their external mode; else on the floor, disarmed.
+
+    Raises:
+        ConfigError: ticks or Δt differ, or vehicles touch at the start.
+    """
+
+    def __init__(
+        self,
+        seats: Sequence[Seat],
+        on_progress: Callable[[float], None] | None = None,
+        on_collision: OnCollision | None = None,
+        *,
+        start_ns: int = 0,
+        airborne: bool = True,
+    ) -> None:
+        configs = [seat.config for seat in seats]
+        _check_equal_grids(configs)
+        first = configs[0]
+        self._flyers = tuple(seat.flyer for seat in seats)
+        self._on_progress = on_progress
+        self._start_ns = start_ns
+        self._tick_ns = round(first.daemon.tick_s * 1e9)
+        self._ticks_per_step = round(first.plant.dt_s / first.daemon.tick_s)
+        self._ticks = 0
+        all_peers = [
+            Peers(
+                seat.config,
+                start_ns,
+                airborne=airborne,
+                shared_link=seat.config.daemon.vehicle == seat.config.daemon.mocap,
+                on_truth=seat.on_truth,
+            )
+            for seat in seats
+        ]
+        self.space = SharedSpace(configs, all_peers, on_collision)
+
+    def run(self, duration_s: float, is_done: Callable[[], bool] = lambda: False) -> None:
+        """Fly all the ticks that begin within `duration_s` from the start, or until the flyers are done."""
+        for tick in range(self._ticks, round(duration_s * 1e9) // self._tick_ns):
+            if is_done():
+                break
+            self._run_tick(tick)
+            self._ticks = tick + 1
+            if self._on_progress is not None and (tick + 1) % self._ticks_per_step == 0:
+                self._on_progress((tick + 1) * self._tick_ns * 1e-9)
+        for peers in self.space.peers:
+            peers.flush()
+
+    def _run_tick(self, tick: int) -> None:
+        at_ns = self._start_ns + tick * self._tick_ns
+        self.space.exchange(at_ns, [flyer.receive for flyer in self._flyers])
+        for flyer, peers in zip(self._flyers, self.space.peers, strict=True):
+            flyer.tick(tick, at_ns, peers.make_sender(at_ns))
+
+
+def _check_equal_grids(configs: Sequence[Config]) -> None:
+    for key, values in (
+        ("daemon.tick_s", [config.daemon.tick_s for config in configs]),
+        ("plant.dt_s", [config.plant.dt_s for config in configs]),
+    ):
+        if len(set(values)) > 1:
+            listed = ", ".join(f"{value:g}" for value in values)
+            raise ConfigError((f"{key}: vehicles of one world differ ({listed} s); give all the same",))
+
+
+class World(FleetWorld):
+    """Flight of one vehicle by `flyer`; see `FleetWorld`.
+
+    Args:
+        config: the whole configuration.
+        on_truth: gets the `Truth` of every Δt boundary, see `Peers`.
     """
 
     def __init__(
@@ -270,27 +425,13 @@ class World:
         start_ns: int = 0,
         airborne: bool = True,
     ) -> None:
-        self._flyer = flyer
-        self._on_progress = on_progress
-        self._start_ns = start_ns
-        self._tick_ns = round(config.daemon.tick_s * 1e9)
-        self._ticks_per_step = round(config.plant.dt_s / config.daemon.tick_s)
-        is_shared = config.daemon.vehicle == config.daemon.mocap
-        self._ticks = 0
-        self.peers = Peers(config, start_ns, airborne=airborne, shared_link=is_shared, on_truth=on_truth)
+        super().__init__((Seat(config, flyer, on_truth),), on_progress, start_ns=start_ns, airborne=airborne)
 
-    def run(self, duration_s: float, is_done: Callable[[], bool] = lambda: False) -> None:
-        """Fly all the ticks that begin within `duration_s` from the start, or until the flyer is done."""
-        for tick in range(self._ticks, round(duration_s * 1e9) // self._tick_ns):
-            if is_done():
-                break
-            self._run_tick(tick)
-            self._ticks = tick + 1
-            if self._on_progress is not None and (tick + 1) % self._ticks_per_step == 0:
-                self._on_progress((tick + 1) * self._tick_ns * 1e-9)
-        self.peers.flush()
+    @property
+    def peers(self) -> Peers:
+        """The vehicle's peers; new ones take the place of the old ones, as after a restart."""
+        return self.space.peers[0]
 
-    def _run_tick(self, tick: int) -> None:
-        at_ns = self._start_ns + tick * self._tick_ns
-        self.peers.exchange(at_ns, self._flyer.receive)
-        self._flyer.tick(tick, at_ns, self.peers.make_sender(at_ns))
+    @peers.setter
+    def peers(self, peers: Peers) -> None:
+        self.space = SharedSpace((), (peers,))

@@ -407,6 +407,34 @@ class Truth(Record, frozen=True, kw_only=True):
     faults: tuple[str, ...] = ()  # faults that act now
 
 
+class Collision(Record, frozen=True, kw_only=True):
+    """Contact of two simulated vehicles, which wrecks both."""
+
+    at_ns: int
+    vehicles: tuple[int, int]  # system ids
+    distance_m: float  # least distance of the centres in the 10 ms of the contact
+    speed_mps: float  # relative speed
+
+
+class ClosestApproach(Record, frozen=True, kw_only=True):
+    """Least true distance of two simulated vehicles."""
+
+    at_ns: int
+    vehicles: tuple[int, int]  # system ids
+    distance_m: float  # of the centres, until both are wrecked
+
+
+class FleetTruth(Record, frozen=True, kw_only=True):
+    """The simulator's own state of all vehicles in one world; one entry a vehicle."""
+
+    at_ns: int
+    vehicles: tuple[int, ...]  # system ids
+    position_m: tuple[Vec3, ...]
+    velocity_mps: tuple[Vec3, ...]
+    mode: tuple[str, ...]
+    wrecked: tuple[bool, ...]  # whether a collision broke its rotors
+
+
 class Header(Record, frozen=True, kw_only=True):
     """First message of a recording: configuration, design, seed and versions."""
 

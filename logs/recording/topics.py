@@ -26,11 +26,14 @@ from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.records import (
     Checked,
+    ClosestApproach,
+    Collision,
     Datagram,
     Decision,
     Ending,
     Estimate,
     Event,
+    FleetTruth,
     Header,
     InternalError,
     LinkEstimate,
@@ -113,6 +116,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/link_estimate", LinkEstimate, "estimate of the link of the positions, at a Δt boundary"),
     Topic(ENDED, Ending, "end of the flight"),
     Topic("/sim/truth", Truth, "true state, in simulated flights"),
+    Topic("/sim/fleet", FleetTruth, "true state of all vehicles in one world, in `world.mcap`"),
+    Topic("/sim/collision", Collision, "collision of two simulated vehicles"),
+    Topic("/sim/closest", ClosestApproach, "closest approach of each pair, at the end"),
     Topic(RECORDER, RecorderNote, "state of the recorder: segments, drops, failed writes"),
 )
 _BY_NAME = {topic.name: topic for topic in TOPICS}

@@ -133,10 +133,11 @@ class Pilot:
 
     @property
     def _is_checking_height(self) -> bool:
-        """Whether floor or height are watched; the linear plant may fly through the floor."""
-        phase = self.phase
+        """Whether floor or height are watched; the linear plant may fly through the floor, unless it falls."""
+        phase, is_wrecked = self.phase, self._vehicle.is_wrecked
+        watches_air = self._linear_plant is None or is_wrecked
         is_above_floor = phase is Phase.CLIMB or phase is Phase.DESCENT
-        return (is_above_floor or (phase is Phase.AIR and self._linear_plant is None)) and self._has_down
+        return (is_above_floor or (phase is Phase.AIR and watches_air)) and (self._has_down or is_wrecked)
 
     def run(self, at_ns: int) -> None:
         """Act on everything due at `at_ns`, with the vehicle moved there."""

@@ -49,6 +49,11 @@ class Vehicle(Protocol):
     grounded: bool  # stands on the floor with its rotors off
 
     @property
+    def is_wrecked(self) -> bool:
+        """Whether a collision broke its rotors."""
+        ...
+
+    @property
     def now_ns(self) -> int:
         """Present time [ns]."""
         ...
@@ -175,6 +180,11 @@ class ControlledPlant:
         return None if self._goal is _Goal.NOTHING or self.grounded else self._control_ns
 
     @property
+    def is_wrecked(self) -> bool:
+        """Whether a collision broke its rotors."""
+        return self._plant.is_wrecked
+
+    @property
     def now_ns(self) -> int:
         """Present time [ns]."""
         return self._plant.now_ns
@@ -216,7 +226,7 @@ class ControlledPlant:
 
     @grounded.setter
     def grounded(self, grounded: bool) -> None:
-        self._plant.grounded = grounded
+        self._plant.grounded = grounded or self.is_wrecked
 
     def accelerate(self, accel_mps2: Vec3) -> None:
         """Hold this acceleration setpoint from now on [m/s²]."""

@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import block_diag, expm, logm
 
+from sim.vehicle.airframe import GRAVITY_MPS2
 from uavctl.arrays import Array
 from uavctl.config.types import Config, PlantConfig
 from uavctl.errors import DesignError
@@ -41,12 +42,25 @@ class LinearModel:
     position_index: tuple[int, ...]  # state index of each axis' position
     velocity_index: tuple[int, ...]  # state index of each axis' velocity
     accel_per_input: Array  # (n_u,) acceleration setpoint per unit of input
+    down_force: Array | None  # (n_x,) x' per downward acceleration by a force; None without a vertical axis
 
     def transition(self, duration_ns: int) -> tuple[Array, Array, Array]:
         """Return A, B, E of a step of `duration_ns` with u and w held; those of the plant for Δt itself."""
         if duration_ns == self.dt_ns:
             return self.a, self.b, self.e
         return _split(expm(self.flow * (duration_ns * 1e-9)), *self.b.shape)
+
+    def respond_to_force(self, duration_ns: int) -> Array:
+        """Return the change of x (n_x,) in a time per downward acceleration by a constant force.
+
+        With x' = F x + f: the last column of expm([[F, f], [0, 0]] t).
+        """
+        n_x = self.a.shape[0]
+        flow = np.zeros((n_x + 1, n_x + 1))
+        if self.down_force is not None:
+            flow[:n_x, :n_x], flow[:n_x, n_x] = self.flow[:n_x, :n_x], self.down_force
+        response: Array = expm(flow * (duration_ns * 1e-9))[:n_x, n_x]
+        return response
 
 
 def _split(m: Array, n_x: int, n_u: int) -> tuple[Array, Array, Array]:
@@ -92,7 +106,23 @@ def make_linear_model(plant: PlantConfig) -> LinearModel:
         position_index=position,
         velocity_index=velocity,
         accel_per_input=np.array(gain, dtype=np.float64),
+        down_force=_find_down_force(plant, flow, velocity),
     )
+
+
+def _find_down_force(plant: PlantConfig, flow: Array, velocity_index: tuple[int, ...]) -> Array | None:
+    """Return x' (n_x,) per downward acceleration: the column of the wind, or the velocity's row for matrices."""
+    if NED_AXES[2] not in plant.axes:
+        return None
+    axis, n = plant.axes.index(NED_AXES[2]), len(plant.axes)
+    if plant.model == "drag-lag":
+        column: Array = flow[: 3 * n, 4 * n + axis]
+    elif plant.model == "velocity-reference":
+        column = flow[: 6 * n, 7 * n + 3 * axis]
+    else:
+        column = np.zeros(len(plant.a))
+        column[velocity_index[axis]] = 1.0
+    return column
 
 
 def _drag_lag_flow(plant: PlantConfig) -> Array:
@@ -173,6 +203,7 @@ class LinearVehicle:
 
     Attributes:
         attitude: Attitude (w, x, y, z), body axes FRD to NED: always level, the nose north.
+        is_wrecked: Whether a collision broke its rotors.
     """
 
     attitude = (1.0, 0.0, 0.0, 0.0)
@@ -182,6 +213,7 @@ class LinearVehicle:
         self._accel_rows = self.model.flow[list(self.model.velocity_index)]  # rows of v'
         self._rng = np.random.default_rng(seed)
         self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
+        self._respond_to_force = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.respond_to_force)
         self._offset_m = config.sim.start_position_m
         x = np.zeros(self.model.a.shape[0])
         for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
@@ -194,7 +226,8 @@ class LinearVehicle:
         self._w: Array = self._draw()
         self._next_boundary_ns = start_ns + self.model.dt_ns
         self.now_ns = start_ns
-        self.grounded = False
+        self.grounded = self.is_wrecked = False
+        self._downwash_mps2 = 0.0
 
     def _draw(self) -> Array:
         return self.model.w_root @ self._rng.standard_normal(self.model.w_root.shape[0])
@@ -208,9 +241,24 @@ class LinearVehicle:
     def state(self) -> Array:
         """Present state x (n_x,)."""
         if self._x is None:
-            a, b, e = self._transition(self.now_ns - self._anchor_ns)
+            duration_ns = self.now_ns - self._anchor_ns
+            if self.is_wrecked:
+                self._x = self._compute_fall(duration_ns * 1e-9)
+                return self._x
+            a, b, e = self._transition(duration_ns)
             self._x = a @ self._anchor_x + b @ self._u + e @ self._w
+            if self._downwash_mps2:
+                self._x = self._x + self._respond_to_force(duration_ns) * self._downwash_mps2
         return self._x
+
+    def _compute_fall(self, t: float) -> Array:
+        """Return the state after a time of free fall without drag [s]: p = p₀ + v₀ t + ½ g t²."""
+        x = np.zeros_like(self._anchor_x)
+        for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
+            g = GRAVITY_MPS2 if NED_AXES[axis] == "down" else 0.0
+            velocity = self._anchor_x[v]
+            x[p], x[v] = self._anchor_x[p] + t * (velocity + 0.5 * t * g), velocity + t * g
+        return x
 
     @property
     def input(self) -> Array:
@@ -231,10 +279,14 @@ class LinearVehicle:
     def acceleration_mps2(self) -> Vec3:
         """Acceleration in local NED [m/s²]; zero on the floor, and along axes that the plant does not have."""
         values = [0.0, 0.0, 0.0]
+        if self.is_wrecked and not self.grounded:
+            return 0.0, 0.0, GRAVITY_MPS2
         if not self.grounded:
             accel = self._accel_rows @ np.concatenate((self.state, self._u, self._w))
             for axis, value in zip(self.model.axes, accel.tolist(), strict=True):
                 values[axis] = value
+            if self._downwash_mps2:
+                values[2] += self._downwash_mps2
         return values[0], values[1], values[2]
 
     def _vec3(self, index: tuple[int, ...], default: Vec3) -> Vec3:
@@ -263,6 +315,8 @@ class LinearVehicle:
             self._anchor_ns = to_ns
         else:
             self._x = None
+            if self.is_wrecked and self.position_m[2] >= 0.0:
+                self.stand_on_floor()
 
     def _set_anchor(self) -> None:
         self._anchor_x = self.state
@@ -270,11 +324,33 @@ class LinearVehicle:
 
     def accelerate(self, accel_mps2: Vec3) -> None:
         """Hold this acceleration setpoint [m/s²] from now on, in the axes that the plant has."""
+        if self.is_wrecked:
+            return
         limited = [min(max(accel_mps2[axis], -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for axis in self.model.axes]
         u = np.array(limited) / self.model.accel_per_input
         if not np.array_equal(u, self._u):
             self._set_anchor()
             self._u = u
+
+    @property
+    def has_downwash(self) -> bool:
+        """Whether its rotors carry it in the air."""
+        return not (self.grounded or self.is_wrecked)
+
+    def set_downwash(self, accel_mps2: float) -> None:
+        """Set the downward acceleration by the downwash of others [m/s²]; without a vertical axis there is none."""
+        if accel_mps2 != self._downwash_mps2 and self.has_down:
+            self._set_anchor()
+            self._downwash_mps2 = accel_mps2
+
+    def wreck(self) -> None:
+        """Break its rotors: it falls without drag to the floor; without a vertical axis it stops."""
+        if self.is_wrecked:
+            return
+        self._set_anchor()
+        self.is_wrecked = True
+        if not self.grounded and (not self.has_down or self.position_m[2] >= 0.0):
+            self.stand_on_floor()
 
     def stand_on_floor(self) -> None:
         """Stand on the floor (z = 0): at rest, with no input, until `grounded` is cleared."""

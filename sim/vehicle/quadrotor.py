@@ -45,6 +45,9 @@ class Quadrotor:
     Args:
         model: the simulator's model of the controller's plant; defines `state` and `input`.
         wind: the air, stepped with the physics.
+
+    Attributes:
+        is_wrecked: whether a collision broke its rotors.
     """
 
     def __init__(
@@ -72,6 +75,8 @@ class Quadrotor:
         self._grid_ns = start_ns
         self._touched_ns: int | None = None
         self._grounded = False
+        self.is_wrecked = False
+        self._downwash_mps2 = 0.0
         self._accel: Vec3 = ZERO
         self._estimate_errors: tuple[Vec3, Vec3] | None = None
         self._down_accel_mps2 = 0.0  # downward acceleration in the last step
@@ -138,7 +143,18 @@ class Quadrotor:
         if self._touched_ns is not None or self._grounded:
             return ZERO
         motion, wrench = self._motion, self._rotors.wrench
-        return compute_acceleration(self._body, motion.attitude, motion.velocity_mps, wrench, self.wind.velocity_mps)
+        return compute_acceleration(
+            self._body, motion.attitude, motion.velocity_mps, wrench, self.wind.velocity_mps, self._down_mps2
+        )
+
+    @property
+    def _down_mps2(self) -> float:
+        return GRAVITY_MPS2 + self._downwash_mps2
+
+    @property
+    def has_downwash(self) -> bool:
+        """Whether its rotors carry it in the air."""
+        return not (self._grounded or self.is_wrecked or self.battery.is_empty) and self._touched_ns is None
 
     @property
     def landed(self) -> bool:
@@ -221,6 +237,14 @@ class Quadrotor:
         """Set the attitude error of its loops about body axes [rad]."""
         self._attitude_error_rad = None if error_rad == ZERO else error_rad
 
+    def set_downwash(self, accel_mps2: float) -> None:
+        """Set the downward acceleration by the downwash of others [m/s²]."""
+        self._downwash_mps2 = accel_mps2
+
+    def wreck(self) -> None:
+        """Break its rotors: it falls, and flies no more."""
+        self.is_wrecked = True
+
     def stand_on_floor(self) -> None:
         """Stand on the floor, rotors off, until `grounded` is cleared."""
         north, east, _ = self.position_m
@@ -265,7 +289,7 @@ class Quadrotor:
             estimate = estimate._replace(attitude=rotate_attitude(motion.attitude, self._attitude_error_rad))
         self._control(estimate)
         wrenches = self._rotors.step()
-        self._motion = integrate_step(self._body, motion, wrenches, self.wind.velocity_mps, STEP_S)
+        self._motion = integrate_step(self._body, motion, wrenches, self.wind.velocity_mps, STEP_S, self._down_mps2)
         self.battery.drain(wrenches[0].thrust_n, STEP_S)
         self._down_accel_mps2 = (self._motion.velocity_mps[2] - motion.velocity_mps[2]) / STEP_S
         self._handle_floor_contact(motion)
@@ -274,12 +298,12 @@ class Quadrotor:
         """Command the rotors; on the floor they idle until a setpoint leads off it."""
         self.cascade.apply_due_setpoint()
         is_idle = self._touched_ns is not None and not self.cascade.is_leaving_floor
-        if is_idle or self.battery.is_empty:
+        if is_idle or self.is_wrecked or self.battery.is_empty:
             self.cascade.step_on_floor(motion)
             self._down_accel_mps2 = 0.0
             self._attitude_loop.reset(motion.rates_rps)
             self._rotors.command(0.0, ZERO, self.battery.max_rps)
-            if self.battery.is_empty:
+            if self.is_wrecked or self.battery.is_empty:
                 self._rotors.stop()
             return
         setpoint = self.cascade.step(

@@ -83,8 +83,10 @@ def reduce_tilt(attitude: Quaternion, factor: float) -> Quaternion:
     return heading * c, tx * c + ty * s, ty * c - tx * s, heading * s
 
 
-def compute_acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrench, wind: Vec3) -> Vec3:
-    """Return the acceleration of the centre of mass in NED [m/s²], with gravity.
+def compute_acceleration(
+    body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrench, wind: Vec3, down_mps2: float = GRAVITY_MPS2
+) -> Vec3:
+    """Return the acceleration of the centre of mass in NED [m/s²], with that of gravity and downwash, `down_mps2`.
 
     Drag in body axes, of the velocity v relative to the air: -(d ΣΩ + ½ ρ C_d A |v|) v, each axis with its own
     coefficients.
@@ -104,11 +106,7 @@ def compute_acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrenc
     fx = scale * (k[0] * total + c[0] * speed) * u
     fy = scale * (k[1] * total + c[1] * speed) * v
     fz = scale * ((k[2] * total + c[2] * speed) * s + wrench.thrust_n)
-    return (
-        r11 * fx + r12 * fy + r13 * fz,
-        r21 * fx + r22 * fy + r23 * fz,
-        r31 * fx + r32 * fy + r33 * fz + GRAVITY_MPS2,
-    )
+    return (r11 * fx + r12 * fy + r13 * fz, r21 * fx + r22 * fy + r23 * fz, r31 * fx + r32 * fy + r33 * fz + down_mps2)
 
 
 def _compute_angular_accel(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
@@ -150,7 +148,12 @@ def _integrate_slopes(start: Vec3, a: Vec3, b: Vec3, c: Vec3, d: Vec3, h: float)
 
 
 def integrate_step(
-    body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], wind: Vec3, h: float
+    body: Body,
+    start: BodyState,
+    wrenches: tuple[Wrench, Wrench, Wrench],
+    wind: Vec3,
+    h: float,
+    down_mps2: float = GRAVITY_MPS2,
 ) -> BodyState:
     """Return the state after one step of Runge and Kutta's fourth-order method, after Munthe-Kaas on the rotations.
 
@@ -162,30 +165,34 @@ def integrate_step(
         wrenches: wrenches of the rotors at the start, the middle and the end of the step.
         wind: velocity of the air in NED, held over the step [m/s].
         h: length of the step [s].
+        down_mps2: downward acceleration by gravity and downwash.
     """
     first, middle, last = wrenches
     position, v1, attitude, w1 = start
     half = 0.5 * h
 
-    a1 = compute_acceleration(body, attitude, v1, first, wind)
+    a1 = compute_acceleration(body, attitude, v1, first, wind, down_mps2)
     s1 = _compute_angular_accel(body, w1, first.torque_nm)
 
     angle = _add_scaled((0.0, 0.0, 0.0), w1, half)
     w2 = _add_scaled(w1, s1, half)
     t2 = _compute_rotation_vector_rate(angle, w2)
-    a2 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a1, half), middle, wind)
+    v2 = _add_scaled(v1, a1, half)
+    a2 = compute_acceleration(body, rotate_attitude(attitude, angle), v2, middle, wind, down_mps2)
     s2 = _compute_angular_accel(body, w2, middle.torque_nm)
 
     angle = _add_scaled((0.0, 0.0, 0.0), t2, half)
     w3 = _add_scaled(w1, s2, half)
     t3 = _compute_rotation_vector_rate(angle, w3)
-    a3 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a2, half), middle, wind)
+    v3 = _add_scaled(v1, a2, half)
+    a3 = compute_acceleration(body, rotate_attitude(attitude, angle), v3, middle, wind, down_mps2)
     s3 = _compute_angular_accel(body, w3, middle.torque_nm)
 
     angle = _add_scaled((0.0, 0.0, 0.0), t3, h)
     w4 = _add_scaled(w1, s3, h)
     t4 = _compute_rotation_vector_rate(angle, w4)
-    a4 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a3, h), last, wind)
+    v4 = _add_scaled(v1, a3, h)
+    a4 = compute_acceleration(body, rotate_attitude(attitude, angle), v4, last, wind, down_mps2)
     s4 = _compute_angular_accel(body, w4, last.torque_nm)
 
     sixth = h * h / 6.0

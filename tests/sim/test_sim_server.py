@@ -331,7 +331,12 @@ def test_simulated_time_runs_at_a_multiple_of_real_time_for_several_vehicles_at_
     clients = [udp() for _ in range(4)]
     told: tuple[list[Truth], list[Truth]] = ([], [])
     seats = [
-        VehicleSetup(config(f"sim.autopilot={name}"), clients[2 * i][1], clients[2 * i + 1][1], told[i].append)
+        VehicleSetup(
+            config(f"sim.autopilot={name}", f"sim.start_position_m=[0,{i},-1]"),
+            clients[2 * i][1],
+            clients[2 * i + 1][1],
+            told[i].append,
+        )
         for i, name in enumerate(("px4", "ardupilot"))
     ]
     readies: list[Ready] = []

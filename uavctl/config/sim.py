@@ -148,6 +148,8 @@ class SimConfig(Section, frozen=True, kw_only=True):
         Literal["few", "onboard"], declare("messages that come unasked: `few`, or `onboard` (over 300 a second)")
     ] = "few"
     fault: Annotated[tuple[FaultConfig, ...], declare("faults in the course of the flight", length=MAX_FAULTS)] = ()
+    radius_m: Annotated[float, declare("of rotors and body; spheres that touch collide", "m", high=100, above=0)] = 0.07
+    downwash: Annotated[float, declare("factor of the force below another vehicle (docs/vehicle.md)", "", 0, 10)] = 1.0
     system_id: Annotated[int, declare("MAVLink system id of the simulated vehicle", "", 1, 250)] = 1
     seed: Annotated[int, declare("seed of every random draw", "", 0, MAX_SEED)] = 0
     start_position_m: Annotated[Position, declare("position at the start, local NED", "m")] = (0.0, 0.0, 0.0)
