@@ -150,7 +150,7 @@ class Interactions:
 
     def __init__(self, bodies: Sequence[WorldBody], start_ns: int, on_collision: OnCollision | None = None) -> None:
         check_start_distances(bodies)
-        self.next_ns = start_ns
+        self.next_ns = self._start_ns = start_ns
         self.collisions: list[Collision] = []
         self._bodies = tuple(bodies)
         self._on_collision = on_collision
@@ -206,7 +206,7 @@ class Interactions:
                 yield at_ns, pair, collision
 
     def _get_time_ns(self, part: float) -> int:
-        return self.next_ns - round((1.0 - part) * PERIOD_NS)
+        return max(self.next_ns - round((1.0 - part) * PERIOD_NS), self._start_ns)
 
     def _set_downwash(self) -> None:
         shares = [0.0] * len(self._bodies)

@@ -203,11 +203,48 @@ def test_a_number_of_vehicles_that_cannot_be_is_refused(number: str) -> None:
 def test_the_command_names_all_ports(capsys: pytest.CaptureFixture[str]) -> None:
     links = ["--vehicle", ANY, "--mocap", ANY]
     assert run(["sim", *links, "--vehicles", "3", "--duration", "0.2", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["vehicles"]
+    told = json.loads(capsys.readouterr().out.splitlines()[0])["vehicles"]
     assert [one["system_id"] for one in told] == [1, 2, 3]
     assert len({one["vehicle"] for one in told}) == 3
     assert run(["sim", *links, "--vehicles", "2", "--duration", "0.2"]) == 0
-    assert [line.split()[:3] for line in capsys.readouterr().out.splitlines()] == [
+    assert [line.split()[:3] for line in capsys.readouterr().out.splitlines()[:2]] == [
         ["system_id", "1", "vehicle"],
         ["system_id", "2", "vehicle"],
     ]
+
+
+def read_encounters(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    links = ["--vehicle", ANY, "--mocap", ANY, "--airborne", "--json"]
+    assert run(["sim", *links, *arguments]) == 0
+    ports, encounters = capsys.readouterr().out.splitlines()
+    assert json.loads(ports)["schema"] == "uavctl/sim/1"
+    told: dict[str, Any] = json.loads(encounters)
+    assert told["schema"] == "uavctl/sim_encounters/1"
+    return told
+
+
+def test_the_end_tells_the_closest_approach_of_each_pair(capsys: pytest.CaptureFixture[str]) -> None:
+    told = read_encounters(capsys, "--vehicles", "3", "--duration", "0.2", "--set", "plant.wind_std_mps2=[0,0,0]")
+    assert told["collisions"] == []
+    assert [one["vehicles"] for one in told["closest"]] == [[1, 2], [1, 3], [2, 3]]
+    assert all(0.0 <= one["time_s"] <= 0.2 for one in told["closest"])
+    assert [one["distance_m"] for one in told["closest"]] == pytest.approx([1.0, 2.0, 1.0])
+
+
+def test_the_end_tells_who_collided_when_and_how_fast(capsys: pytest.CaptureFixture[str]) -> None:
+    # Wind alone moves them apart or together: spheres that almost touch meet soon.
+    shaken = ["sim.radius_m=0.4999", "plant.wind_std_mps2=[3,3,0.1]", "sim.seed=4"]
+    settings = [part for one in shaken for part in ("--set", one)]
+    told = read_encounters(capsys, "--vehicles", "2", "--duration", "4", "--speed", "50", *settings)
+    (collision,) = told["collisions"]
+    (closest,) = told["closest"]
+    assert collision["vehicles"] == closest["vehicles"] == [1, 2]
+    assert closest["distance_m"] <= collision["distance_m"] < 2 * 0.4999
+    assert 0.0 < collision["time_s"] < 4.0
+    assert collision["speed_mps"] > 0.0
+
+
+def test_vehicles_that_would_start_in_each_other_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--vehicles", "2", "--duration", "1", "--set", "sim.radius_m=0.6"]
+    assert run(["sim", "--vehicle", ANY, "--mocap", ANY, *arguments]) == 2
+    assert "vehicles 1 and 2 start 1.00 m apart" in capsys.readouterr().err

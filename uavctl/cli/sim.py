@@ -12,14 +12,14 @@ from cyclopts import Parameter, validators
 
 from sim.faults import find_fault_problems
 from sim.fleet import make_fleet
-from sim.server import Ready, VehicleSetup, serve_all
+from sim.server import Encounters, Ready, VehicleSetup, serve_all
 from uavctl.cli.common import DEFAULTS, Common, locate_design_errors
 from uavctl.cli.output import make_message_console, write_document
 from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.cli.sim_view import show_view
 from uavctl.config.load import add_faults
-from uavctl.records import Truth
+from uavctl.records import ClosestApproach, Collision, Truth
 from uavctl.wiring.rest import check_axes
 
 if TYPE_CHECKING:
@@ -85,7 +85,11 @@ def sim(
         ),
     ] = False,
 ) -> int:
-    """Serve simulated vehicles; a line for each (one document with --json) appears when all ports are open."""
+    """Serve simulated vehicles; a line for each (one document with --json) appears when all ports are open.
+
+    Several vehicles share one world: they collide, and push lower ones down. At the end a line for each collision and
+    for the closest approach of each pair (a second document with --json) appears.
+    """
     overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)
     loaded = common.with_overrides(overrides).load()
     config = loaded.config
@@ -109,7 +113,7 @@ def sim(
 
     viewer = show_view(make_message_console(), config) if view else nullcontext()
     with stop_on_signals() as stopped, viewer as on_snapshot:
-        serve_all(
+        encounters = serve_all(
             vehicle_setups,
             duration_s=duration,
             airborne=airborne,
@@ -119,7 +123,39 @@ def sim(
             on_snapshot=on_snapshot,
             wrap_port=make_port_wrapper(config.security),
         )
+    if vehicles > 1:
+        _print_encounters(encounters, as_json=common.json)
     return 0
+
+
+def _print_encounters(encounters: Encounters, *, as_json: bool) -> None:
+    """Print collisions and the closest approach of each pair; times are since the start."""
+
+    def list_fields(met: Collision | ClosestApproach) -> dict[str, object]:
+        fields: dict[str, object] = {
+            "time_s": round((met.at_ns - encounters.start_ns) * 1e-9, 3),
+            "vehicles": met.vehicles,
+            "distance_m": met.distance_m,
+        }
+        return fields | ({"speed_mps": met.speed_mps} if isinstance(met, Collision) else {})
+
+    document = {
+        "collisions": [list_fields(collision) for collision in encounters.collisions],
+        "closest": [list_fields(approach) for approach in encounters.closest_approaches],
+    }
+    if as_json:
+        write_document("sim_encounters", document)
+        return
+    for collision in encounters.collisions:
+        sys.stdout.write(f"collision of {_describe(collision, encounters)} at {collision.speed_mps:.2f} m/s\n")
+    for approach in encounters.closest_approaches:
+        sys.stdout.write(f"closest {_describe(approach, encounters)}: {approach.distance_m:.3f} m\n")
+    sys.stdout.flush()
+
+
+def _describe(met: Collision | ClosestApproach, encounters: Encounters) -> str:
+    first, second = met.vehicles
+    return f"{first} and {second} after {(met.at_ns - encounters.start_ns) * 1e-9:.2f} s"
 
 
 def _print_ports(vehicle_setups: Sequence[VehicleSetup], opened: Sequence[Ready], *, as_json: bool) -> None:
