@@ -43,6 +43,7 @@ class VehicleSnapshot:
 
 
 VEHICLE, MOCAP = "vehicle", "mocap"
+COLLISION_FAULT = "collision"  # of a truth, from a collision on
 Due = tuple[int, str, bytes]  # (at_ns, link, datagram)
 Handler = Callable[[str, bytes, int], Received]  # of a datagram: link, bytes and time
 
@@ -165,7 +166,7 @@ class Peers:
         """Kinds of the faults that act now; a random occlusion and a past collision are such too."""
         faults = find_active_faults(self._config, self.now_ns - self._start_ns)
         if self.vehicle.is_wrecked:
-            faults = (*faults, "collision")
+            faults = (*faults, COLLISION_FAULT)
         return (*faults, "occluded") if self.cameras.is_occluded and "occluded" not in faults else faults
 
     def take_snapshot(self) -> VehicleSnapshot:
