@@ -64,10 +64,11 @@ class Channel:
 
     Loss is Bernoulli, Gilbert-Elliott (the chain starts in the good state and steps before each packet) or
     empirical (a run of losses is drawn after each arrival, and before the first packet) or that of a trace (from its
-    first packet on, and over again), and total within a blackout. What gets through is delayed by `delay_s` plus a
-    uniform draw up to `jitter_s`, or as the trace was, so packets may overtake each other. A duplicate has its own
-    delay, but with a trace. A bit flip, a cut and padding act on a packet before it is doubled. What arrives in a span
-    of `held` is kept until its end.
+    first packet on, and over again), and total within a blackout. With `scheduled`, the sender has a turn each
+    `wait_s` from the start on and sends the newest packet; all others are lost. What gets through is delayed by
+    `delay_s` plus a uniform draw up to `jitter_s`, or as the trace was, so packets may overtake each other. A duplicate
+    has its own delay, but with a trace. A bit flip, a cut and padding act on a packet before it is doubled. What
+    arrives in a span of `held` is kept until its end.
 
     Attributes:
         counters: Counts of the packets so far.
@@ -98,6 +99,7 @@ class Channel:
         self._run_probabilities = np.cumsum(link.gaps)
         self._remaining_losses = _NO_RUN
         self._packet_number = 0  # of the next packet
+        self._turns = -1  # turns of the sender so far; the first one is at the start
 
     def push(self, at_ns: int, data: bytes, *, is_certain: bool = False) -> None:
         """Send a packet at `at_ns`; the link never loses one that `is_certain`."""
@@ -174,6 +176,10 @@ class Channel:
                 )
             self._remaining_losses -= 1
             return 0.0 if self._remaining_losses == _NO_RUN else 1.0
+        if link.model == "scheduled":
+            turns = math.floor(since_ns * 1e-9 / link.wait_s)
+            count, self._turns = turns - self._turns, turns
+            return link.loss**count
         if link.model == "trace":
             return 0.0
         if link.probability:

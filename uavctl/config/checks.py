@@ -423,6 +423,12 @@ def _check_link(link: LinkConfig) -> Iterator[ConfigProblem]:
         yield from _check_gaps(link.gaps)
     if link.model == "trace":
         yield from _check_trace(link.trace_s)
+    if link.model == "scheduled" and not link.wait_s:
+        yield ConfigProblem(
+            "link.wait_s",
+            'is missing, and model "scheduled" needs it',
+            "give the longest time between two messages to this vehicle; `uavctl fleet check` prints it",
+        )
     if link.probability and link.probability[-1] == 0.0:
         yield ConfigProblem(
             "link.probability",

@@ -45,10 +45,11 @@ class LinkConfig(Section, frozen=True, kw_only=True):
         ),
     ] = 0.0
     model: Annotated[
-        Literal["bernoulli", "gilbert-elliott", "empirical", "trace"],
+        Literal["bernoulli", "gilbert-elliott", "empirical", "trace", "scheduled"],
         declare(
             "losses: `bernoulli` (each by itself), `gilbert-elliott` (in bursts, by a good and a bad state), "
-            "`empirical` (in measured runs) or `trace` (losses and delays as measured)"
+            "`empirical` (in measured runs), `trace` (losses and delays as measured) or `scheduled` (each by itself, "
+            "from a sender that serves other vehicles too)"
         ),
     ] = "bernoulli"
     probability: Annotated[
@@ -87,6 +88,9 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     burst_loss: Annotated[
         float, declare("`gilbert-elliott`: loss in the bad state; in the good one it is `loss`", "", 0, 1)
     ] = 1.0
+    wait_s: Annotated[
+        float, declare("`scheduled`: longest time from one message to this vehicle to the next", "s", 0, MAX_DELAY_S)
+    ] = 0.0
     delay_s: Annotated[float, declare("constant delay of a packet, not with `trace`", "s", 0, MAX_DELAY_S)] = 0.0
     jitter_s: Annotated[float, declare("uniform extra delay; packets may overtake", "s", 0, MAX_DELAY_S)] = 0.0
     duplicate: Annotated[float, declare("probability that a packet comes twice", "", 0, 1)] = 0.0

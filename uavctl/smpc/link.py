@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -231,6 +232,24 @@ class TracedAges:
         for i in range(steps):
             missing &= np.roll(self.late, i) > i
         return float(missing.mean())
+
+
+@dataclass(frozen=True)
+class ScheduledAges:
+    """Ages of a vehicle whose sender serves it at least once in each wait, with independent losses.
+
+    A position counts at age below n if it was captured in the last n steps and has arrived. So its message left the
+    sender in a span of n steps, less the time on its way and the time from its capture to the sending.
+    """
+
+    loss: float  # p of a message
+    wait_steps: float  # W, longest time between two messages
+    late_steps: float  # D, longest time from a capture to the arrival
+
+    def outage(self, steps: int) -> float:
+        """See `AgeModel`."""
+        # P(a >= n) <= p^m,  m = ⌊(n - D) / W⌋: whatever the schedule does, m messages leave in time
+        return self.loss ** max(0, math.floor((steps - self.late_steps) / self.wait_steps + _ROUNDING))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from uavctl.smpc.link import (
     LateArrivals,
     LatePackets,
     LinkModel,
+    ScheduledAges,
     TracedAges,
     bernoulli,
     empirical,
@@ -40,6 +41,8 @@ def build_link(config: Config) -> Arrivals:
     Raises:
         DesignError: No position can be counted on.
     """
+    if config.link.model == "scheduled":
+        return _build_scheduled_steps(config)
     return _build_channel(config, count_packets_per_step(config))
 
 
@@ -145,6 +148,8 @@ def build_delayed_link(config: Config) -> LinkModel:
     Raises:
         DesignError: No position can be counted on, or the model of the losses does not go with such delays.
     """
+    if config.link.model == "scheduled":
+        return _build_scheduled_steps(config)
     link, dt_s = config.link, config.plant.dt_s
     independent = link.model == "bernoulli" and not link.probability
     if config.is_age_conditioned and independent and config.source.rate_hz * dt_s >= 1.0 - _ROUNDING:
@@ -180,6 +185,8 @@ def build_ages(config: Config) -> AgeModel:
     if link.model == "bernoulli" and link.probability:
         link = msgspec.structs.replace(link, loss=1.0 - min(link.probability), probability=())
         config = msgspec.structs.replace(config, link=link)
+    if link.model == "scheduled":
+        return build_scheduled_ages(config)
     if link.model == "bernoulli" or _get_max_delay_s(config) < dt_s:
         return build_delayed_link(config)
     _check_rate(config)
@@ -191,6 +198,33 @@ def build_ages(config: Config) -> AgeModel:
     return LateArrivals(
         build_channel(config),
         np.array([[_compute_delay_probability(config, float(span_s + s)) for s in before_s] for span_s in spans_s]),
+    )
+
+
+def build_scheduled_ages(config: Config) -> ScheduledAges:
+    """Build the bound of the ages under a schedule; a position waits for its message up to the cameras' period.
+
+    Without `source.rate_hz` there is one position a step, as for the other models.
+    """
+    link, dt_s = config.link, config.plant.dt_s
+    period_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
+    return ScheduledAges(link.loss, link.wait_s / dt_s, (_get_max_delay_s(config) + period_s) / dt_s)
+
+
+def _build_scheduled_steps(config: Config) -> Arrivals:
+    """Build the chain of steps that each have a message in time.
+
+    Raises:
+        DesignError: Not every step has one.
+    """
+    empty = build_scheduled_ages(config).outage(1)
+    if empty < 1.0:
+        return bernoulli(np.array([1.0 - empty]))
+    raise DesignError(
+        "link.wait_s",
+        f"a step of {config.plant.dt_s:g} s has no message that is sure to be in time, with {config.link.wait_s:g} s "
+        "between two and the time on its way",
+        "take smpc.scheme = `age-conditioned`, a longer step, or a shorter wait",
     )
 
 

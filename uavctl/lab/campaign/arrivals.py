@@ -84,6 +84,10 @@ def _find_losses(link: LinkConfig, dt_s: float, draws: Array) -> Flags:
         is_lost = _draw_gap_losses(link, draws)
     elif link.model == "trace":
         is_lost = np.zeros(draws.shape[:2], dtype=np.bool_)
+    elif link.model == "scheduled":
+        # Turns of the sender up to step k, from a random phase φ: ⌊k Δt / W + φ⌋
+        turns = np.floor(np.arange(-1, steps) * dt_s / link.wait_s + draws[:, :1, 0])
+        is_lost = draws[:, :, 1] >= 1.0 - link.loss ** np.diff(turns, axis=1)
     elif link.probability:
         arrival_chances = np.array(link.probability)[np.minimum(np.arange(steps), len(link.probability) - 1)]
         is_lost = draws[:, :, 1] >= arrival_chances
