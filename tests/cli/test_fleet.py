@@ -31,6 +31,7 @@ from uavctl.config import load_config
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
 from uavctl.errors import ConfigError, NotReachedError
 from uavctl.records import Truth
+from uavctl.wiring.link import build_ages
 
 SPACING_M = 0.5
 WEST, EAST = (-2.5, -0.4), (0.4, 2.5)  # the vehicles' limits, east
@@ -121,6 +122,59 @@ def test_without_daemons_status_and_land_fail(fleet_file: Path, capsys: pytest.C
     assert run(["fleet", "land", str(fleet_file)]) == 1
     output = capsys.readouterr().err
     assert "west: land not reached" in output and "east: land not reached" in output
+
+
+RADIO = "[radio]\nbytes_per_s = 5760\nrate_hz = 50\nloss = 0.3\n"
+
+
+def make_radio_file(folder: Path, *lines: str, count: int = 2) -> Path:
+    """A fleet of `count` vehicles with a radio; in [radio] the given lines replace those of the same key."""
+    keys = dict(line.split(" = ") for line in [*RADIO.splitlines()[1:], *lines])
+    radio = "[radio]\n" + "".join(f"{key} = {value}\n" for key, value in keys.items())
+    width, path = 5.0 / count, folder / "fleet.toml"
+    boxes = [(-2.5 + width * i, -2.5 + width * (i + 1) - 0.11) for i in range(count)]
+    entries = [make_entry(f"v{i}", box, f"udpin://127.0.0.1:{24541 + i}") for i, box in enumerate(boxes)]
+    path.write_text("spacing_m = 0.1\n" + radio + "".join(entries))
+    return path
+
+
+def test_the_radio_of_the_example_carries_its_vehicles(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["fleet", "check", str(ROOT / "docs" / "examples" / "radio.toml"), "--json"]) == 0
+    radio = json.loads(capsys.readouterr().out)["radio"]
+    assert radio["slot_s"] == pytest.approx(44 / 5760, abs=1e-9)
+    assert radio["carried"] >= 4
+
+
+def test_each_vehicle_is_designed_for_the_radio(tmp_path: Path) -> None:
+    members = read_fleet(make_radio_file(tmp_path, 'schedule = "round-robin"', "messages_per_s = 60", count=4)).members
+    for member in members:
+        link, source = member.config.link, member.config.source
+        # 4 turns of 1/60 s are longer than the cameras' period: the channel is never idle
+        assert (link.model, link.loss, source.rate_hz) == ("scheduled", 0.3, 50.0)
+        assert link.wait_s == pytest.approx(4 / 60)
+        assert build_ages(member.config).outage(member.config.smpc.horizon) < 1e-6
+
+
+def test_more_vehicles_mean_more_risk_and_too_many_are_not_carried(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = make_radio_file(tmp_path, "bytes_per_s = 100", 'schedule = "round-robin"', count=5)
+    assert run(["fleet", "check", str(path), "--json"]) == 1
+    radio = json.loads(capsys.readouterr().out)["radio"]
+    silences = [load["silence_probability"] for load in radio["loads"]]
+    assert silences == sorted(silences)
+    # Of 0.44 s each: within the horizon of 2.4 s, less 0.09 s on the way, 5 turns of one vehicle, 2 of two, 1 of three
+    assert silences[:3] == pytest.approx([0.3**5, 0.3**2, 0.3])
+    assert radio["carried"] == 1
+
+
+def test_the_longest_wait_has_a_slot_for_each_vehicle(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"radio\.max_wait_s"):
+        read_fleet(make_radio_file(tmp_path, "max_wait_s = 0.01"))
+    with pytest.raises(ConfigError, match="has no budget"):
+        path = make_radio_file(tmp_path)
+        path.write_text(path.read_text().replace("bytes_per_s = 5760\n", ""))
+        read_fleet(path)
 
 
 INTERVAL = st.tuples(st.floats(-5, 5), st.floats(0.01, 3)).map(lambda one: (one[0], one[0] + one[1]))

@@ -23,9 +23,11 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 from msgspec import Meta
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
+from uavctl.arrays import SECOND_NS
 from uavctl.cli import main
 from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, make_key_overrides
 from uavctl.cli.ctl import send_request
@@ -41,6 +43,14 @@ from uavctl.daemon.control_socket import ControlRequest, find_control_folder, ma
 from uavctl.daemon.health import Health
 from uavctl.errors import ConfigError, NotReachedError
 from uavctl.flight.limits import AXES
+from uavctl.wiring.radio import (
+    RadioConfig,
+    RadioLoad,
+    compute_loads,
+    compute_slot_ns,
+    find_radio_problems,
+    make_link_overrides,
+)
 
 STATUS_PERIOD_S = 0.5  # between two requests for the status of all vehicles
 POLL_S = 0.1  # between two checks of their processes
@@ -72,6 +82,7 @@ class FleetFile(Section, frozen=True, kw_only=True):
 
     spacing_m: Annotated[float, Meta(gt=0.0, le=1000.0)]  # smallest horizontal distance of two vehicles' limits
     vehicle: Annotated[tuple[FleetVehicle, ...], Meta(max_length=MAX_VEHICLES)]
+    radio: RadioConfig = RadioConfig()  # the channel that carries the positions of all
 
 
 @dataclass(frozen=True)
@@ -101,6 +112,7 @@ class Fleet:
 
     members: tuple[Member, ...]
     nearest_m: float  # smallest horizontal distance of two vehicles' limits; infinite for a single one
+    radio: RadioConfig
 
 
 def read_fleet(path: Path) -> Fleet:
@@ -112,14 +124,18 @@ def read_fleet(path: Path) -> Fleet:
     document, source, file_problems = read_document(FleetFile, path)
     if document is not None and not document.vehicle:
         file_problems.append(ConfigProblem("vehicle", "there is none", "write a [[vehicle]] table for each"))
+    if document is not None:
+        file_problems += find_radio_problems(document.radio, len(document.vehicle))
     if document is None or file_problems:
         raise ConfigError(tuple(source.describe(problem) for problem in file_problems))
     config_problems: list[str] = []
     members: list[Member] = []
+    radio_overrides = make_link_overrides(document.radio, len(document.vehicle)) if document.radio.has_budget else []
     for number, vehicle in enumerate(document.vehicle):
         path_beside = path.parent / vehicle.config
         config = str(path_beside) if vehicle.config.endswith(".toml") else vehicle.config
-        overrides = [*vehicle.set, *make_key_overrides(daemon__vehicle=vehicle.vehicle, daemon__mocap=vehicle.mocap)]
+        urls = make_key_overrides(daemon__vehicle=vehicle.vehicle, daemon__mocap=vehicle.mocap)
+        overrides = [*radio_overrides, *vehicle.set, *urls]
         try:
             loaded = load(config, overrides).config
         except ConfigError as error:
@@ -133,7 +149,7 @@ def read_fleet(path: Path) -> Fleet:
     if config_problems or fleet_problems:
         raise ConfigError((*config_problems, *(source.describe(problem) for problem in fleet_problems)))
     pairs = [compute_gap_m(vehicle, second) for vehicle, second in combinations(members, 2)]
-    return Fleet(tuple(members), min(pairs, default=math.inf))
+    return Fleet(tuple(members), min(pairs, default=math.inf), document.radio)
 
 
 def compute_gap_m(first: Member, second: Member) -> float:
@@ -172,17 +188,35 @@ def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[Conf
 
 @fleet_app.command(help_epilogue=format_example("fleet check"))
 def check(file: File, /, *, json: QuietJson = False) -> int:
-    """Check whether a fleet can be flown: its configurations, links, and how far apart its boxes are; sends nothing."""
+    """Check whether a fleet can be flown: its configurations, links, boxes, and what its radio carries; sends nothing.
+
+    Exit code 1: the radio does not carry all vehicles.
+    """
     fleet = read_fleet(file)
-    document = {
+    loads = compute_loads(fleet.radio, [m.config for m in fleet.members], MAX_VEHICLES)
+    carried = max((load.vehicles for load in loads if load.is_carried), default=0)
+    document: dict[str, object] = {
         "vehicles": [
             {"name": member.name, "daemon": member.daemon, "url": member.config.daemon.vehicle}
             for member in fleet.members
         ],
         "nearest_m": fleet.nearest_m if math.isfinite(fleet.nearest_m) else None,
     }
-    Common(json=json).show("fleet/check", document, lambda: _make_box_table(fleet))
-    return 0
+    if fleet.radio.has_budget:
+        document["radio"] = {
+            "slot_s": compute_slot_ns(fleet.radio) / SECOND_NS,
+            "carried": carried,
+            "loads": [load._asdict() for load in loads],
+        }
+
+    def make_tables() -> Group:
+        tables = [_make_box_table(fleet)]
+        if fleet.radio.has_budget:
+            tables.append(_make_radio_table(fleet.radio, len(fleet.members), carried, loads))
+        return Group(*tables)
+
+    Common(json=json).show("fleet/check", document, make_tables)
+    return 1 if fleet.radio.has_budget and carried < len(fleet.members) else 0
 
 
 @fleet_app.command(help_epilogue=format_example("fleet fly"))
@@ -415,6 +449,22 @@ def _make_box_table(fleet: Fleet) -> Table:
     return make_table(
         title, ("vehicle", "link", *(f"{axis} [m]" for axis in AXES)), rows, ("vehicle", "link"), fold=True
     )
+
+
+def _make_radio_table(radio: RadioConfig, count: int, carried: int, loads: Sequence[RadioLoad]) -> Table:
+    rows = [
+        [
+            f"{load.vehicles}{' (this fleet)' if load.vehicles == count else ''}",
+            f"{load.wait_s:.3f}",
+            f"{load.mean_age_s:.3f}",
+            f"{load.silence_probability:.2g}",
+            "yes" if load.is_carried else "no",
+        ]
+        for load in loads
+    ]
+    title = f"radio: {SECOND_NS / compute_slot_ns(radio):.0f} positions a second, {radio.schedule}, {carried} vehicles"
+    headings = ("vehicles", "longest wait [s]", "mean age in turns [s]", "P(no position in the horizon)", "carried")
+    return make_table(title, headings, rows, headings[:1], fold=True)
 
 
 def _make_exit_table(flights: Sequence[FleetFlight]) -> Table:

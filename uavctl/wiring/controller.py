@@ -192,7 +192,7 @@ def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | N
     if for_flight and estimator.bias_drift:
         estimator_plant = add_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
     if cov is None and for_flight:
-        cov = _compute_settled_covariance(config, plant)
+        cov = compute_settled_covariance(config, plant)
     elif cov is None:
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
@@ -233,10 +233,12 @@ def _compute_position_age_s(config: Config) -> float:
     link, dt_s = config.link, config.plant.dt_s
     # It may be captured at the beginning of the step, unless later ones follow.
     capture_age_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
+    if link.model == "scheduled":
+        capture_age_s += link.wait_s
     return min(dt_s, capture_age_s + link.delay_s + link.jitter_s)
 
 
-def _compute_settled_covariance(config: Config, plant: Plant) -> Array:
+def compute_settled_covariance(config: Config, plant: Plant) -> Array:
     """Compute the filter's error covariance at the begin of a plan, with a position and inertial data in every step."""
     dt_ns = round(plant.dt_s * SECOND_NS)
     kalman = make_kalman(plant, build_estimator(config), dt_ns)

@@ -1,0 +1,164 @@
+"""Composition of a sender for several vehicles from `[radio]`: slots, longest wait, link, and values of messages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import Annotated, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from scipy.linalg import block_diag
+
+from uavctl.arrays import SECOND_NS, Array
+from uavctl.config.document import ConfigProblem, Section
+from uavctl.config.types import Config
+from uavctl.schedule.ages import compute_periodic_tail
+from uavctl.schedule.channel import Budget, compute_frame_bytes
+from uavctl.schedule.scheduler import ScheduleName
+from uavctl.schedule.value import compute_age_costs, compute_message_values, predict_covariances
+from uavctl.smpc.estimate import add_bias
+from uavctl.wiring.controller import build_plant, compute_settled_covariance
+from uavctl.wiring.link import build_ages
+
+# An adaptive schedule may let a vehicle wait for two rounds: with less it is hardly free, with more the design, which
+# counts on the longest wait, has larger margins.
+ADAPTIVE_ROUNDS = 2
+MAX_AGE_S = 5.0  # larger ages cost as this one; a vehicle lands earlier
+_TAIL_ROUNDS = 400  # rounds of the mean age's sum; the rest is below 1e-15 up to a loss of 0.9
+
+
+class RadioConfig(Section, frozen=True, kw_only=True):
+    """The channel that carries the positions of all vehicles of a fleet."""
+
+    bytes_per_s: Annotated[float, Meta(gt=0.0)] | None = None  # on the wire; 57,600 baud are 5,760
+    messages_per_s: Annotated[float, Meta(gt=0.0)] | None = None
+    rate_hz: Annotated[float, Meta(gt=0.0, le=1000.0)] = (
+        50.0  # positions a second that the cameras give of each vehicle
+    )
+    schedule: ScheduleName = "value"
+    max_wait_s: Annotated[float, Meta(gt=0.0, le=60.0)] | None = None  # nobody waits longer; None: one or two rounds
+    loss: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0  # probability that a message is lost
+    feedback_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0  # longest time to a vehicle's report; 0: none comes
+    signed: bool = False  # messages carry a signature
+
+    @property
+    def has_budget(self) -> bool:
+        """Whether there is a channel for all vehicles."""
+        return self.bytes_per_s is not None or self.messages_per_s is not None
+
+
+class RadioLoad(NamedTuple):
+    """Ages of the vehicles with some number of them."""
+
+    vehicles: int
+    wait_s: float  # longest time between two messages to a vehicle
+    mean_age_s: float  # of a position in round-robin, without the times on its way
+    silence_probability: float  # P(a >= H), the largest of all configurations; then a vehicle flies its fallback
+    is_carried: bool  # the risk beyond age H leaves some for the plans, for each configuration
+
+
+def compute_slot_ns(radio: RadioConfig) -> int:
+    """Return the time of one position on the channel [ns]."""
+    budget = Budget(radio.messages_per_s, radio.bytes_per_s)
+    return budget.compute_slot_ns(compute_frame_bytes(signed=radio.signed))
+
+
+def compute_max_wait_slots(radio: RadioConfig, count: int) -> int:
+    """Return the longest wait of a vehicle, in slots; too few for all of them if `max_wait_s` is too short."""
+    if radio.max_wait_s is not None:
+        return int(radio.max_wait_s * SECOND_NS / compute_slot_ns(radio) + 1e-9)
+    return count * (1 if radio.schedule == "round-robin" else ADAPTIVE_ROUNDS)
+
+
+def compute_link_wait_s(radio: RadioConfig, count: int) -> float:
+    """Return the longest time between two messages to a vehicle [s], for the link model.
+
+    The channel is never idle while a round takes longer than the cameras' period. Else it may have nothing to send,
+    and a vehicle waits for its next position in addition.
+    """
+    slot_s, period_s = compute_slot_ns(radio) / SECOND_NS, 1.0 / radio.rate_hz
+    wait_s = compute_max_wait_slots(radio, count) * slot_s
+    return wait_s if count * slot_s > period_s else wait_s + period_s
+
+
+def find_radio_problems(radio: RadioConfig, count: int) -> list[ConfigProblem]:
+    """Return what is wrong with a radio for `count` vehicles."""
+    if radio == RadioConfig():
+        return []
+    if not radio.has_budget:
+        return [ConfigProblem("radio", "has no budget", "give bytes_per_s or messages_per_s")]
+    slot_s = compute_slot_ns(radio) / SECOND_NS
+    if compute_max_wait_slots(radio, count) < count:
+        return [
+            ConfigProblem(
+                "radio.max_wait_s",
+                f"{radio.max_wait_s:g} s is too short: {count} messages of {slot_s:.4g} s take {count * slot_s:.4g} s",
+                f"give {count * slot_s:.4g} or more, a larger budget, or fewer vehicles",
+            )
+        ]
+    return []
+
+
+def make_link_overrides(radio: RadioConfig, count: int) -> list[str]:
+    """Return the overrides by which a vehicle is designed for the radio."""
+    return [
+        'link.model="scheduled"',
+        f"link.loss={radio.loss!r}",
+        f"link.wait_s={compute_link_wait_s(radio, count)!r}",
+        f"source.rate_hz={radio.rate_hz!r}",
+    ]
+
+
+def compute_loads(radio: RadioConfig, configs: Sequence[Config], max_vehicles: int) -> list[RadioLoad]:
+    """Return the ages with 1 … `max_vehicles` vehicles, as far as the longest wait has slots for them.
+
+    A further vehicle counts as one of the given configurations, whose links are replaced.
+    """
+    loads: list[RadioLoad] = []
+    if not radio.has_budget:
+        return loads
+    slot_s = compute_slot_ns(radio) / SECOND_NS
+    for count in range(1, max_vehicles + 1):
+        if find_radio_problems(radio, count):
+            break
+        wait_s = compute_link_wait_s(radio, count)
+        probabilities, is_carried = [], True
+        for config in configs:
+            link = msgspec.structs.replace(config.link, model="scheduled", loss=radio.loss, wait_s=wait_s)
+            source = msgspec.structs.replace(config.source, rate_hz=radio.rate_hz)
+            changed = msgspec.structs.replace(config, link=link, source=source)
+            probability = build_ages(changed).outage(config.smpc.horizon)
+            # Σ_{t<=H} π_t ε_t <= 1 - δ_x - P(a >= H)
+            is_carried &= probability < 1.0 - config.smpc.delta_x
+            probabilities.append(probability)
+        # E a = Σ_{n>0} P(a >= n)
+        tail = compute_periodic_tail(range(count), 0, radio.loss, _TAIL_ROUNDS * count)
+        loads.append(RadioLoad(count, wait_s, float(tail[1:].sum()) * slot_s, max(probabilities), is_carried))
+    return loads
+
+
+def compute_vehicle_costs(config: Config, slot_s: float) -> tuple[Array, Array]:
+    """Return the cost of a vehicle's age, and the deviation of its position [m], at ages of 0 … slots (n,)."""
+    plant = build_plant(config)
+    cov, state_cost = compute_settled_covariance(config, plant), np.diag(config.cost.state)
+    if config.estimator.bias_drift:
+        plant = add_bias(plant, config.estimator.bias_drift, force=config.estimator.inertial_std_mps2 > 0.0)
+        state_cost = block_diag(state_cost, np.zeros((plant.n_u, plant.n_u)))
+    size = plant.n_x
+    covs = predict_covariances(plant, cov[:size, :size], slot_s, 2 + math.ceil(MAX_AGE_S / slot_s))
+    index = list(plant.position_index)
+    return compute_age_costs(covs, state_cost[:size, :size]), np.sqrt(covs[:, index, index].max(axis=1))
+
+
+def build_message_values(config: Config, radio: RadioConfig) -> tuple[Array, Array]:
+    """Return V(h) of a vehicle (n,), and the deviation of its position at ages of 0 … slots (n + 1,) [m]."""
+    costs, stds_m = compute_vehicle_costs(config, compute_slot_ns(radio) / SECOND_NS)
+    return compute_message_values(costs, radio.loss), stds_m
+
+
+def compute_quantile(config: Config) -> float:
+    """Return κ of the allowed risk, Φ⁻¹(δ_x)."""
+    return NormalDist().inv_cdf(config.smpc.delta_x)
