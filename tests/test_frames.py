@@ -38,6 +38,15 @@ def test_known_directions(convention: Convention, given_m: Vec3, ned_m: Vec3) ->
     assert Frame(convention).to_ned(given_m) == ned_m
 
 
+@pytest.mark.parametrize("convention", ["ned", "enu", "flu"])
+@pytest.mark.parametrize("euler", [False, True])
+@pytest.mark.parametrize("yaw_deg", [0.0, 35.0, -160.0])
+def test_an_attitude_comes_back_from_ned(convention: Convention, euler: bool, yaw_deg: float) -> None:
+    frame, attitude = Frame(convention, yaw_deg=yaw_deg), (0.5, -0.1, 0.7, 0.5)
+    back = frame.attitude_from_ned(frame.attitude_to_ned(attitude, euler=euler), euler=euler)
+    assert abs(np.dot(back, attitude)) == pytest.approx(1.0)  # a rotation and its negative are one
+
+
 def test_yaw_is_the_heading_of_the_first_axis() -> None:
     frame = Frame("ned", yaw_deg=90.0)
     assert frame.to_ned((1.0, 0.0, 0.0)) == (0.0, 1.0, 0.0)  # heading 90: the first axis points east

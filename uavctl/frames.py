@@ -108,6 +108,14 @@ class Frame:
         rotated = multiply_quaternions(_AXES_ROTATION_TO_NED[self.convention], attitude)
         return multiply_quaternions((math.cos(half_rad), 0.0, 0.0, math.sin(half_rad)), rotated)
 
+    def attitude_from_ned(self, attitude: Quaternion, *, euler: bool) -> Quaternion:
+        """Convert a body's attitude in local NED to this frame; the inverse of `attitude_to_ned`, up to the sign."""
+        half_rad = -math.radians(self.yaw_deg) / 2
+        rotated = multiply_quaternions((math.cos(half_rad), 0.0, 0.0, math.sin(half_rad)), attitude)
+        # These rotations are their own inverses.
+        rotated = multiply_quaternions(_AXES_ROTATION_TO_NED[self.convention], rotated)
+        return multiply_quaternions(rotated, _ROTATION_FLU_TO_FRD) if euler and self.convention != "ned" else rotated
+
     def velocity_from_ned(self, velocity_mps: Vec3) -> Vec3:
         """Convert a free vector of local NED to this frame; the inverse of `velocity_to_ned`."""
         n, e, d = velocity_mps

@@ -53,6 +53,7 @@ _COMMANDS = {
         "fleet:fleet_app",
         "Fly several vehicles from one file, apart from each other: check, fly, status, land.",
     ),
+    "cameras": ("cameras:cameras", "Send the positions of all vehicles of a fleet over one channel with a budget."),
     "sim": ("sim:sim", "Run the simulated vehicle and cameras alone, for any MAVLink client."),
     "check": ("check:check", "Before take-off: rates, ages, frames, clocks, parameters, disk; never arms."),
     "design": ("design:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),

@@ -75,6 +75,8 @@ class FleetVehicle(Section, frozen=True, kw_only=True):
     set: tuple[str, ...] = ()  # as --set
     vehicle: str | None = None  # URL; else daemon.vehicle
     mocap: str | None = None  # the same of the positions
+    cameras: str = ""  # `uavctl cameras`: source of its positions, any that `daemon.mocap` may name
+    positions: str = ""  # and URL to send them to; empty: where its daemon listens, on this computer
 
 
 class FleetFile(Section, frozen=True, kw_only=True):
@@ -92,6 +94,8 @@ class Member:
     name: str
     options: tuple[str, ...]  # options of `uavctl fly` for the configuration
     config: Config
+    cameras: str = ""  # source of its positions for the sender
+    positions: str = ""  # URL that the sender sends them to
 
     @property
     def daemon(self) -> str:
@@ -113,6 +117,7 @@ class Fleet:
     members: tuple[Member, ...]
     nearest_m: float  # smallest horizontal distance of two vehicles' limits; infinite for a single one
     radio: RadioConfig
+    spacing_m: float
 
 
 def read_fleet(path: Path) -> Fleet:
@@ -144,12 +149,12 @@ def read_fleet(path: Path) -> Fleet:
             ]
             continue
         options = ("--config", config, *(part for override in overrides for part in ("--set", override)))
-        members.append(Member(vehicle.name, options, loaded))
+        members.append(Member(vehicle.name, options, loaded, vehicle.cameras, vehicle.positions))
     fleet_problems = list(_find_problems(members, document.spacing_m))
     if config_problems or fleet_problems:
         raise ConfigError((*config_problems, *(source.describe(problem) for problem in fleet_problems)))
     pairs = [compute_gap_m(vehicle, second) for vehicle, second in combinations(members, 2)]
-    return Fleet(tuple(members), min(pairs, default=math.inf), document.radio)
+    return Fleet(tuple(members), min(pairs, default=math.inf), document.radio, document.spacing_m)
 
 
 def compute_gap_m(first: Member, second: Member) -> float:

@@ -111,6 +111,9 @@ class SourceConfig(Section, frozen=True, kw_only=True):
     ] = ("VISION_POSITION_ESTIMATE", "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY")
     system_id: Annotated[int, declare("MAVLink system id that positions must come from; 0 takes any", "", 0, 255)] = 0
     rate_hz: Annotated[float, declare("positions that the design counts on; 0: one each Δt", "1/s", 0, 1000)] = 0.0
+    report: Annotated[
+        bool, declare("report the stamp of each newest position to its sender, by a PING of that time")
+    ] = False
 
 
 class ClockConfig(Section, frozen=True, kw_only=True):

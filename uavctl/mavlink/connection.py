@@ -124,6 +124,8 @@ class MavlinkConnection:
     ) -> None:
         self._name, self._roles, self._uses_vehicle_time = name, roles, vehicle_time
         self._own_address = (daemon.system_id, daemon.component_id)
+        self._reports_positions = source.report
+        self._reported_stamps_us: dict[tuple[int, int], int] = {}  # of the sender of the newest position
         url = daemon.vehicle if VEHICLE in roles else daemon.mocap
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
         self._encoder = Encoder(*self._own_address)
@@ -402,8 +404,16 @@ class MavlinkConnection:
         items: tuple[Item, ...] = self._handle_vehicle_message(message, at_ns) if VEHICLE in self._roles else ()
         if isinstance(message, Position) and MOCAP in self._roles:
             sample = self._positions.make_sample(message, at_ns)
+            if sample is not None and self._reports_positions and message.stamp_us is not None:
+                self._report_position(message.stamp_us, (message.system, message.component), sample.seq)
             return items if sample is None else (*items, sample)
         return items
+
+    def _report_position(self, stamp_us: int, address: tuple[int, int], number: int) -> None:
+        """Report the newest position to its sender; an older one that came late is none."""
+        if stamp_us > self._reported_stamps_us.get(address, -1):
+            self._reported_stamps_us = {address: stamp_us}
+            self._replies.append(self._encoder.encode_position_report(stamp_us, number, *address))
 
     def _handle_vehicle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
         """Handle a message for the vehicle monitor; return its items."""

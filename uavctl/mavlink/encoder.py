@@ -28,6 +28,7 @@ _HEARTBEAT = MessageLayout(mavlink.MAVLink_heartbeat_message)
 _ODOMETRY = MessageLayout(mavlink.MAVLink_odometry_message)
 _PARAM_REQUEST_LIST = MessageLayout(mavlink.MAVLink_param_request_list_message)
 _PARAM_REQUEST_READ = MessageLayout(mavlink.MAVLink_param_request_read_message)
+_PING = MessageLayout(mavlink.MAVLink_ping_message)
 _SET_GPS_GLOBAL_ORIGIN = MessageLayout(mavlink.MAVLink_set_gps_global_origin_message)
 _SET_POSITION_TARGET_LOCAL_NED = MessageLayout(mavlink.MAVLink_set_position_target_local_ned_message)
 _TIMESYNC = MessageLayout(mavlink.MAVLink_timesync_message)
@@ -68,6 +69,25 @@ class Encoder:
         if not all(-_INT64 <= value < _INT64 for value in (tc1_ns, ts1_ns)):
             raise UnsendableError(f"TIMESYNC of {tc1_ns}, {ts1_ns}: not signed 64-bit numbers")
         return self._pack(_TIMESYNC, tc1_ns, ts1_ns)
+
+    def encode_position_report(self, stamp_us: int, number: int, target_system: int, target_component: int) -> bytes:
+        """PING that answers a position as its request: its stamp, to its sender.
+
+        PING is the message of MAVLink whose answer repeats a 64-bit time of the receiver's choice
+        (mavlink.io/en/services/ping.html); TIMESYNC answers would be taken for those of a clock.
+        """
+        return self._pack(_PING, stamp_us, number % 2**32, target_system, target_component)
+
+    def encode_position(self, stamp_us: int, position_m: Vec3, angles_rad: Vec3) -> bytes:
+        """VISION_POSITION_ESTIMATE without a covariance, so that it is short on the wire.
+
+        Raises:
+            UnsendableError: a value is not finite, or the stamp does not fit.
+        """
+        values = (*position_m, *angles_rad)
+        if not all(map(math.isfinite, values)) or not 0 <= stamp_us < 2**64:
+            raise UnsendableError(f"pose {values}, stamp {stamp_us} us: not finite, or no stamp")
+        return self._pack(_VISION_POSITION_ESTIMATE, stamp_us, *values, [0.0] * 21)
 
     def encode_setpoint(self, setpoint: Setpoint, target_system: int, target_component: int) -> bytes:
         """SET_POSITION_TARGET_LOCAL_NED with the acceleration, and the yaw if there is one.

@@ -60,10 +60,14 @@ class RadioLoad(NamedTuple):
     is_carried: bool  # the risk beyond age H leaves some for the plans, for each configuration
 
 
+def make_budget(radio: RadioConfig) -> Budget:
+    """Return the budget of the channel."""
+    return Budget(radio.messages_per_s, radio.bytes_per_s)
+
+
 def compute_slot_ns(radio: RadioConfig) -> int:
     """Return the time of one position on the channel [ns]."""
-    budget = Budget(radio.messages_per_s, radio.bytes_per_s)
-    return budget.compute_slot_ns(compute_frame_bytes(signed=radio.signed))
+    return make_budget(radio).compute_slot_ns(compute_frame_bytes(signed=radio.signed))
 
 
 def compute_max_wait_slots(radio: RadioConfig, count: int) -> int:
@@ -105,6 +109,7 @@ def find_radio_problems(radio: RadioConfig, count: int) -> list[ConfigProblem]:
 def make_link_overrides(radio: RadioConfig, count: int) -> list[str]:
     """Return the overrides by which a vehicle is designed for the radio."""
     return [
+        *(["source.report=true"] if radio.feedback_s else []),
         'link.model="scheduled"',
         f"link.loss={radio.loss!r}",
         f"link.wait_s={compute_link_wait_s(radio, count)!r}",
