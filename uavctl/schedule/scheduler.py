@@ -70,9 +70,9 @@ def _score_waiting(moment: Moment) -> Array:
 def _score_value(moment: Moment) -> Array:
     # Without a message now, the age after this slot is that of this moment: h + 1
     h = (moment.at_ns - moment.captures_ns + moment.slot_ns // 2) // moment.slot_ns - 1
-    h = np.clip(h, 0, moment.values.shape[1] - 1)
+    h = np.minimum(np.maximum(h, 0), moment.values.shape[1] - 1)
     # w_i Σ_n P(n) V_i(h_n)
-    values = np.take_along_axis(moment.values, h, axis=1)
+    values = moment.values[np.arange(len(h))[:, None], h]
     return np.asarray(moment.weights * (values @ moment.arrival_weights), dtype=np.float64)
 
 
@@ -85,6 +85,9 @@ SCHEDULES: dict[ScheduleName, Callable[[Moment], Array]] = {
 
 class Scheduler:
     """Chooses the vehicle of each slot; times and arrivals are arguments.
+
+    Attributes:
+        ages_s: Expected age of each vehicle's newest position before the last choice [s].
 
     Args:
         schedule: Name of the rule.
@@ -118,6 +121,7 @@ class Scheduler:
                 f"set it to {len(values) * slot_ns * 1e-9:.3g} s or more, or raise the radio's budget",
             )
         self._score, self._slot_ns, self._max_wait_slots = SCHEDULES[schedule], slot_ns, max_wait_slots
+        self.ages_s: list[float] = []
         self._slot, self._values, self._arrival_weights = 0, values, compute_arrival_weights(loss)
         self._captures_ns: Times = np.empty((len(values), MAX_UNCERTAIN + 1), dtype=np.int64)
         self.vehicles = tuple(
@@ -147,7 +151,18 @@ class Scheduler:
         candidates = self._find_candidates()
         if not candidates:
             return None
-        scores = self._score(self._make_moment(at_ns)).tolist()
+        moment = Moment(
+            at_ns,
+            self._slot,
+            self._slot_ns,
+            np.array([vehicle.served_slot for vehicle in self.vehicles], dtype=np.float64),
+            self._captures_ns,
+            self._arrival_weights,
+            np.array([vehicle.weight for vehicle in self.vehicles]),
+            self._values,
+        )
+        self.ages_s = (1e-9 * compute_mean_ages_ns(moment)).tolist()
+        scores = self._score(moment).tolist()
         # Of equal scores the longest wait counts, then the lower number.
         chosen = max(candidates, key=lambda i: (scores[i], -self.vehicles[i].served_slot, -i))
         vehicle = self.vehicles[chosen]
@@ -158,28 +173,11 @@ class Scheduler:
         self._slot += 1
         return chosen
 
-    def compute_ages_s(self, at_ns: int) -> list[float]:
-        """Return the expected age of each vehicle's newest position [s]."""
-        ages_s: list[float] = (1e-9 * compute_mean_ages_ns(self._make_moment(at_ns))).tolist()
-        return ages_s
-
-    def _make_moment(self, at_ns: int) -> Moment:
-        return Moment(
-            at_ns,
-            self._slot,
-            self._slot_ns,
-            np.array([vehicle.served_slot for vehicle in self.vehicles], dtype=np.float64),
-            self._captures_ns,
-            self._arrival_weights,
-            np.array([vehicle.weight for vehicle in self.vehicles]),
-            self._values,
-        )
-
     def _find_candidates(self) -> list[int]:
         """Return the vehicles that may be served without making another one wait too long."""
         waiting = [i for i, vehicle in enumerate(self.vehicles) if vehicle.captured_ns is not None]
-        waiting.sort(key=lambda i: self.vehicles[i].deadline_slot)
-        for k, i in enumerate(waiting):
-            if self.vehicles[i].deadline_slot <= self._slot + k:
-                return waiting[: k + 1]
+        deadlines = sorted((self.vehicles[i].deadline_slot, i) for i in waiting)
+        for k, (deadline_slot, _) in enumerate(deadlines):
+            if deadline_slot <= self._slot + k:
+                return [i for _, i in deadlines[: k + 1]]
         return waiting

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.arrays import SECOND_NS, Array
+from uavctl.arrays import SECOND_NS
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.connections import CAMERA_SYSTEM_ID
 from uavctl.config.types import Config
@@ -157,7 +157,6 @@ class PositionSender:
         if at_ns - self._weighted_ns >= WEIGHT_PERIOD_NS:
             self._weighted_ns = at_ns
             self._update_weights()
-        ages_s = tuple(self._scheduler.compute_ages_s(at_ns))
         number = self._scheduler.choose(at_ns)
         if number is None:
             return None
@@ -170,20 +169,20 @@ class PositionSender:
         target.captured_ns_by_stamp[stamp_us] = captured_ns
         self._channel.occupy(at_ns, len(frame))
         self.sent[number] += 1
-        return SentPosition(number, captured_ns, frame, ages_s)
+        return SentPosition(number, captured_ns, frame, tuple(self._scheduler.ages_s))
 
     def _update_weights(self) -> None:
         """Set w_i by the distance to the nearest limit, and half of the free distance to another vehicle."""
-        known = {i: np.array(target.position_m) for i, target in enumerate(self._targets) if target.position_m}
-        for i, position_m in known.items():
+        positions_m = np.array([target.position_m or (np.inf,) * 3 for target in self._targets])
+        known = np.flatnonzero(np.isfinite(positions_m[:, 0]))
+        horizontal_m = positions_m[known, :2]
+        # Height does not count, as in the vehicles' limits.
+        gaps_m = np.linalg.norm(horizontal_m[:, None] - horizontal_m[None, :], axis=2) - self._spacing_m
+        np.fill_diagonal(gaps_m, np.inf)
+        half_gaps_m = 0.5 * gaps_m.min(axis=1, initial=np.inf)
+        for i, half_gap_m in zip(known.tolist(), half_gaps_m.tolist(), strict=True):
             target = self._targets[i]
-            columns = position_m[: len(target.lower_m)]
-            distances_m = [*(columns - target.lower_m), *(target.upper_m - columns)]
-            distances_m += [_compute_half_gap_m(position_m, known[j], self._spacing_m) for j in known if j != i]
-            weight = compute_weight(float(min(distances_m)), self._wait_stds_m[i], self._quantiles[i])
+            columns = positions_m[i, : len(target.lower_m)]
+            wall_m = min((columns - target.lower_m).min(), (target.upper_m - columns).min())
+            weight = compute_weight(min(float(wall_m), half_gap_m), self._wait_stds_m[i], self._quantiles[i])
             self._scheduler.vehicles[i].weight = weight
-
-
-def _compute_half_gap_m(first_m: Array, second_m: Array, spacing_m: float) -> float:
-    """Return half of the distance of two vehicles beyond `spacing_m`; height does not count, as in their limits."""
-    return 0.5 * (float(np.hypot(*(first_m - second_m)[:2])) - spacing_m)
