@@ -117,7 +117,7 @@ def test_a_look_tells_what_the_vehicle_does() -> None:
 def test_without_a_terminal_it_is_said_and_told_line_by_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["sim", "--vehicle", ANY, "--mocap", ANY, "--vehicles", "2", "--view", "--duration", "0.3"]) == 0
     out, err = capsys.readouterr()
-    assert len(out.splitlines()) == 2
+    assert len(out.splitlines()) == 3  # a vehicle each, and their closest approach
     first, *lines = err.splitlines()
     assert "no terminal" in first
     assert [text.split("  ")[1] for text in lines[-2:]] == ["vehicle 1", "vehicle 2"]
