@@ -9,6 +9,8 @@ from typing import Self
 
 from mcap.writer import Writer
 
+from uavctl.errors import RecordingError
+
 TOPIC = "/uavctl/sender"
 _SCHEMA = {
     "title": "uavctl.SentPosition",
@@ -30,11 +32,17 @@ class SenderRecording:
     Args:
         names: Names of the vehicles.
         zero_utc_ns: UTC of time 0 of the monotonic clock [ns since 1970].
+
+    Raises:
+        RecordingError: There is such a file, or it cannot be made.
     """
 
     def __init__(self, path: Path, names: list[str], zero_utc_ns: int) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("xb")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("xb")
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another file") from error
         self._names, self._zero_utc_ns = names, zero_utc_ns
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="", library="uavctl")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import socket
+import subprocess
+import sys
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -104,6 +107,30 @@ def test_a_fleet_that_cannot_be_served_is_refused_before_anything_is_opened(
     assert run(["cameras", str(tmp_path / "fleet.toml"), "--out", str(tmp_path / "out.mcap")]) == 2
     assert expected_text in capsys.readouterr().err
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_ctrl_c_ends_it_with_a_whole_recording(tmp_path: Path) -> None:
+    text, out = (ROOT / "docs" / "examples" / "radio.toml").read_text(), tmp_path / "sender.mcap"
+    for number in range(2 * COUNT):
+        old = 14560 + number if number < COUNT else 14660 + number - COUNT
+        with reserve_port() as reserved:
+            text = text.replace(f"0.0.0.0:{old}", f"127.0.0.1:{reserved.getsockname()[1]}")
+    (tmp_path / "fleet.toml").write_text(text)
+    command = [sys.executable, "-P", "-m", "uavctl", "cameras", str(tmp_path / "fleet.toml"), "--out", str(out)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
+        assert process.stderr is not None and "4 vehicles" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 1  # nobody was sent a position
+    with out.open("rb") as file:
+        assert not list(make_reader(file).iter_messages())
+
+
+def test_an_older_recording_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "sender.mcap"
+    out.write_bytes(b"older")
+    assert run(["cameras", str(ROOT / "docs" / "examples" / "radio.toml"), "--out", str(out)]) != 0
+    assert str(out) in capsys.readouterr().err
+    assert out.read_bytes() == b"older"
 
 
 def test_a_fleet_without_a_radio_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,7 @@ from uavctl.schedule.scheduler import SCHEDULES, ScheduleName, Scheduler
 from uavctl.schedule.value import compute_age_costs, compute_message_values, compute_weight, predict_covariances
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant, drag_lag
+from uavctl.wiring.radio import RadioConfig, compute_link_wait_s, compute_max_wait_slots
 
 SLOT_NS = 1_000_000
 SLOTS = 60  # ages of the dynamic program
@@ -132,6 +133,44 @@ def test_nobody_waits_longer_than_the_longest_wait(
         if has_feedback and arrived[slot]:
             scheduler.add_feedback(chosen, (slot + 1) * SLOT_NS, (slot + 1) * SLOT_NS)
         assert all(slot - at < max_wait_slots for at in last)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    schedule=st.sampled_from(sorted(SCHEDULES)),
+    phases_ns=st.lists(st.integers(0, 19_999_999), min_size=1, max_size=7),
+    slot_ns=st.integers(2_000_000, 30_000_000),
+    max_rounds=st.floats(1.0, 3.0),
+)
+def test_with_cameras_of_50_hz_the_wait_is_that_of_the_link_model(
+    schedule: ScheduleName, phases_ns: list[int], slot_ns: int, max_rounds: float
+) -> None:
+    period_ns, count = 20_000_000, len(phases_ns)
+    radio = RadioConfig(
+        messages_per_s=1e9 / slot_ns, rate_hz=50.0, schedule=schedule, max_wait_s=max_rounds * count * slot_ns * 1e-9
+    )
+    max_wait_slots, wait_s = compute_max_wait_slots(radio, count), compute_link_wait_s(radio, count)
+    winds = [(0.05, 0.2, 3.0)[number % 3] for number in range(count)]
+    scheduler = Scheduler(
+        schedule,
+        np.array([compute_message_values(make_costs(wind), 0.3) for wind in winds]),
+        slot_ns=slot_ns,
+        max_wait_slots=max(count, max_wait_slots),
+        loss=0.3,
+        feedback_delay_ns=0,
+        start_ns=0,
+    )
+    sent_ns, at_ns = [0] * count, period_ns  # every vehicle has a position by then
+    while at_ns < 40 * period_ns:
+        for number, phase_ns in enumerate(phases_ns):
+            scheduler.add_position(number, (at_ns - phase_ns) // period_ns * period_ns + phase_ns)
+        chosen = scheduler.choose(at_ns)
+        if chosen is not None:
+            assert at_ns - sent_ns[chosen] <= wait_s * 1e9 + period_ns * (sent_ns[chosen] == 0) + 1000
+            sent_ns[chosen] = at_ns
+        # Idle up to the next position of any vehicle
+        at_ns += slot_ns if chosen is not None else min(period_ns - (at_ns - phase) % period_ns for phase in phases_ns)
+    assert min(sent_ns) >= at_ns - wait_s * 1e9 - period_ns - slot_ns
 
 
 def test_a_vehicle_that_comes_back_makes_nobody_wait_too_long() -> None:

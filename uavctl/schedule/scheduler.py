@@ -5,16 +5,18 @@ i, last served in slot l_i, has the deadline d_i = l_i + M. Let d_(1) <= d_(2) <
 t + k - 1 for some k, the next k slots belong to the first k vehicles; then the choice is among those of the smallest
 such k, else among all.
 
-**Statement.** If M >= N, and each vehicle has a new position in each slot, every vehicle is served at least once in any
-M slots.
+**Statement.** Let M >= N, and let each vehicle have a new position at the latest N slots after its last message. Then
+every vehicle is served at least once in any M slots.
 
 **Proof.** d_(k) >= t + k - 1 for all k, at the start with d_i = t + M - 1. Serve vehicle i of the choice above. Those
 before i in the order have k below the smallest tight one, so d_(k) >= t + k. Those after i move up by one, so with
 their new number k, d_(k) >= t + k. Vehicle i becomes the last one with d = t + M >= t + N. So the invariant holds in
-slot t + 1, and its first row d_(1) >= t is the statement. ∎
+slot t + 1, and its first row d_(1) >= t is the statement. One of the k vehicles of a tight row has a new position:
+their l_i differ and are at most t + k - 1 - M, so the first one was served M >= N slots ago. ∎
 
-A vehicle without a new position is left out. If it was away for more than M slots, its deadline begins anew at its
-return: it becomes the last of at most N vehicles, and the invariant holds for the others.
+A round of N slots longer than the cameras' period meets the assumption. In a shorter one, a vehicle may wait for its
+next position in addition. A vehicle that was away for more than M slots begins anew at its return: it becomes the last
+of at most N vehicles, and the invariant holds for the others.
 """
 
 from __future__ import annotations
@@ -175,9 +177,15 @@ class Scheduler:
 
     def _find_candidates(self) -> list[int]:
         """Return the vehicles that may be served without making another one wait too long."""
-        waiting = [i for i, vehicle in enumerate(self.vehicles) if vehicle.captured_ns is not None]
-        deadlines = sorted((self.vehicles[i].deadline_slot, i) for i in waiting)
+        waiting = {i for i, vehicle in enumerate(self.vehicles) if vehicle.captured_ns is not None}
+        # A vehicle between two positions has a deadline too; one whose deadline has passed is away.
+        deadlines = sorted(
+            (vehicle.deadline_slot, i)
+            for i, vehicle in enumerate(self.vehicles)
+            if i in waiting or vehicle.deadline_slot >= self._slot
+        )
         for k, (deadline_slot, _) in enumerate(deadlines):
-            if deadline_slot <= self._slot + k:
-                return [i for _, i in deadlines[: k + 1]]
-        return waiting
+            candidates = [i for _, i in deadlines[: k + 1] if i in waiting]
+            if deadline_slot <= self._slot + k and candidates:
+                return candidates
+        return list(waiting)
