@@ -88,6 +88,10 @@ def test_an_age_beyond_the_design_is_told_and_one_beyond_a_step_fails() -> None:
     # Plans of the other scheme count with every age up to the horizon.
     planned = run_check(["link.jitter_s=0.4"], ["link.jitter_s=0.02", "smpc.scheme=age-conditioned"])
     assert state(planned, "position age") is ItemState.NOTE
+    # A sender of several vehicles lets a position wait for its turn, up to the cameras' period.
+    turns = ["link.model=scheduled", "link.wait_s=0.3", "source.rate_hz=10", "smpc.scheme=age-conditioned"]
+    waiting = run_check(["link.jitter_s=0.1"], ["link.jitter_s=0.02", *turns])
+    assert state(waiting, "position age") is ItemState.GOOD
 
 
 def test_a_gap_as_long_as_the_horizon_fails() -> None:

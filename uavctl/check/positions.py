@@ -125,6 +125,8 @@ def _check_gaps(data: CheckData, config: Config, at_ns: int) -> Item:
 def _check_age(data: CheckData, config: Config) -> Item:
     ages_s = sorted((sample.received_ns - sample.captured_ns) * 1e-9 for sample in data.samples)
     p95_s, limit_s = ages_s[int(0.95 * (len(ages_s) - 1))], config.link.delay_s + config.link.jitter_s
+    if config.link.model == "scheduled":  # the newest position waits for its turn, up to the next one
+        limit_s += 1.0 / config.source.rate_hz if config.source.rate_hz else config.plant.dt_s
     has_timesync = any(stats.clock_source == "timesync" for stats in data.stats.values())
     note = "" if has_timesync else "; counted from the quickest one, as the source answers no TIMESYNC"
     value = f"median {ages_s[len(ages_s) // 2] * 1e3:.1f} ms, 95 % within {p95_s * 1e3:.1f} ms{note}"

@@ -61,8 +61,17 @@ def cameras(
     ):
         print_message(f"sending the positions of {len(names)} vehicles; Ctrl-C ends it")
         end_ns = None if duration is None else monotonic_ns() + round(duration * 1e9)
+        closed: set[str] = set()
         while not stopped() and (end_ns is None or monotonic_ns() < end_ns):
             _run_once(sender, connections, recording)
+            for name in {name for name, connection in connections.items() if connection.closed} - closed:
+                closed.add(name)
+                direction, _, number = name.partition(" ")
+                side = "source" if direction == "from" else "link"
+                print_message(f"{names[int(number)]}: its {side} is closed: {connections[name].url}")
+    if sender.refused:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(sender.refused.items()))
+        print_message(f"not used: {reasons}")
     counts = {name: sender.sent[number] for number, name in enumerate(names)}
     document = {"out": str(out), "sent": counts, "refused": dict(sender.refused)}
     rows = [[name, str(count)] for name, count in counts.items()]
