@@ -546,6 +546,23 @@ def test_what_an_exact_response_leaves_is_the_acceleration_less_what_setpoints_g
     assert response.compute_onset_evidence(state, replace(ROOM, lag_s=ZERO))[0] > 1.0
 
 
+@pytest.mark.parametrize("kind", ["turned by 90°", "turned by 180°", "mirrored in east", "not at all"])
+def test_a_bound_hides_no_evidence_above_it(kind: str) -> None:
+    rng, known = np.random.default_rng([*WRONG_HORIZONTAL].index(kind)), []
+    for part in np.linspace(0.1, 1.0, 10):
+        blend = part * WRONG_HORIZONTAL[kind][0] + (1.0 - part) * np.eye(2)
+        state = make_state(rng, (blend, np.eye(1)), 0, rng.uniform(0.0, 2.0))
+        last_before = state.samples[-1][0] - 350 * MS, state.samples[-5][1]
+        state = structs.replace(state, samples=(*state.samples[:-5], last_before, *state.samples[-4:]))
+        evidence = response.compute_onset_evidence(state, ROOM)
+        for bound in (1.5 * NEAR, 0.999 * evidence[0], 1.001 * evidence[0] + 1e-9):
+            found = response.compute_onset_evidence(state, ROOM, bound)
+            assert found == evidence if evidence[0] > bound else found[0] <= bound
+        assert response.compute_onset_evidence(state, ROOM, 1e9) == (0.0, "")
+        known.append(evidence[0])
+    assert max(known) > 1.5 * NEAR
+
+
 @pytest.mark.parametrize(("jump_mps2", "finds"), [(2.0493901531919194, False), (2.04939015319192, True)])
 def test_a_response_is_compared_where_an_exact_one_leaves_more_than_the_least_bound(
     jump_mps2: float, finds: bool
