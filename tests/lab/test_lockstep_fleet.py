@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from logs.recording.reader import read_kind
+from sim.vehicle.airframe import GRAVITY_MPS2
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
@@ -129,3 +130,23 @@ def test_vehicles_with_one_system_id_are_refused(tmp_path: Path) -> None:
 def test_vehicles_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"vehicles 1 and 2 start 0\.10 m apart"):
         fly_pair(tmp_path, [(0.0, 0.0, -1.0), (0.1, 0.0, -1.0)], [(0.0, 0.0, -1.0), (1.0, 0.0, -1.0)])
+    assert list(tmp_path.rglob("*.mcap")) == []
+
+
+def test_a_vehicle_that_hovers_below_another_one_is_pushed_down_and_holds(tmp_path: Path) -> None:
+    places: list[Vec3] = [(0.0, 0.0, -1.6), (0.0, 0.0, -1.2)]
+
+    def fly_lower(strength: float) -> list[Truth]:
+        flight = fly_pair(tmp_path / str(strength), places, places, f"sim.downwash={strength}")
+        assert flight.collisions == ()
+        return read_truths(flight)[1]
+
+    blown, calm = fly_lower(1.0), fly_lower(0.0)
+    # PX4 flies an acceleration open loop after 0.08 s: until the controller sees the fall, x = ½ a t².
+    at_s, share = 0.2, 6.0 / 34.0
+    sunk_m = blown[round(at_s / 0.05)].position_m[2] - calm[round(at_s / 0.05)].position_m[2]
+    assert sunk_m == pytest.approx(0.5 * share * GRAVITY_MPS2 * at_s**2, rel=0.2)
+    assert max(truth.position_m[2] for truth in blown) < -0.8
+    for truth in blown[-20:]:
+        assert truth.position_m == pytest.approx((0.0, 0.0, -1.2), abs=0.15)
+        assert math.hypot(*truth.velocity_mps) < 0.3

@@ -84,11 +84,14 @@ class _WorldRecord:
     """Recording of the truth of all vehicles of one world, and of their encounters."""
 
     def __init__(self, path: Path, prepared: Sequence[Prepared], command: str | None) -> None:
-        first = prepared[0]
-        self._recorder = BatchRecorder(path, first.config.log)
+        self._first, self._command = prepared[0], command
+        self._recorder = BatchRecorder(path, self._first.config.log)
         self._ids = tuple(one.config.sim.system_id for one in prepared)
         self._truths: dict[int, dict[int, Truth]] = {}  # by boundary and vehicle
-        put_header(self._recorder, first, started_ns=0, command=command)
+
+    def begin(self) -> None:
+        """Begin with the header of the first vehicle."""
+        put_header(self._recorder, self._first, started_ns=0, command=self._command)
 
     def put_truth(self, number: int, truth: Truth) -> None:
         """Take the truth of one vehicle; that of all is recorded once it is complete."""
@@ -158,6 +161,7 @@ class LockstepFleet:
             for one, recorder in zip(prepared, self._recorders, strict=True)
         )
         self._ended_ns = [0 for _ in prepared]
+        self._has_begun = False
         self.collisions: tuple[Collision, ...] = ()
         self.closest_approaches: tuple[ClosestApproach, ...] = ()
         self.wall_s = 0.0
@@ -182,9 +186,6 @@ class LockstepFleet:
         """
         lands = landing_s is not None
         duration_s = max(one.config.duration_s for one in self._prepared)
-        for one, recorder, loop in zip(self._prepared, self._recorders, self.loops, strict=True):
-            put_header(recorder, one, started_ns=0, command=self._command)
-            loop.account.ends_in_flight = not lands
         virtual_loops = [
             _VirtualTimeLoop(loop, observer, lands=lands)
             for loop, observer in zip(self.loops, observers or [None] * len(self.loops), strict=True)
@@ -203,6 +204,7 @@ class LockstepFleet:
             for number, (one, virtual_loop) in enumerate(zip(self._prepared, virtual_loops, strict=True))
         ]
         world = FleetWorld(seats, check_continued, self._record_collision, airborne=not lands)
+        self._begin(ends_in_flight=not lands)
         began_s = time.perf_counter()
         try:
             world.run(duration_s, lambda: lands and are_finished())
@@ -219,7 +221,7 @@ class LockstepFleet:
             self.collisions, self.closest_approaches = world.space.collisions, world.space.closest_approaches
 
     def close(self) -> tuple[RecorderStatus, ...]:
-        """End each recording with how its flight ended (`ending` of its loop).
+        """End each recording with how its flight ended (`ending` of its loop); one without a flight has no file.
 
         Returns:
             State of each recording, in order of the vehicles; that of the world's truth is the last one.
@@ -228,11 +230,20 @@ class LockstepFleet:
             for approach in self.closest_approaches:
                 if self._ids[number] in approach.vehicles:
                     recorder.put(CLOSEST, self._ended_ns[number], approach)
-            recorder.put(ENDED, self._ended_ns[number], self.loops[number].ending)
+            if self._has_begun:
+                recorder.put(ENDED, self._ended_ns[number], self.loops[number].ending)
         statuses = [recorder.close() for recorder in self._recorders]
         if self._world_record is not None:
             statuses.append(self._world_record.close(max(self._ended_ns), self.closest_approaches))
         return tuple(statuses)
+
+    def _begin(self, *, ends_in_flight: bool) -> None:
+        self._has_begun = True
+        for one, recorder, loop in zip(self._prepared, self._recorders, self.loops, strict=True):
+            put_header(recorder, one, started_ns=0, command=self._command)
+            loop.account.ends_in_flight = ends_in_flight
+        if self._world_record is not None:
+            self._world_record.begin()
 
     def _note_requested_end(self, cause: Cause) -> None:
         for loop in self.loops:
