@@ -27,6 +27,7 @@ def name_constraints(
     position_index: Sequence[int],
     velocity_index: Sequence[int],
     further: Sequence[tuple[str, str]] = (),
+    n_gusts: int = 0,
 ) -> ConstraintNames:
     """Make the names of a plant's states, and of the rows of {x | c_x x <= b_x}.
 
@@ -36,12 +37,15 @@ def name_constraints(
         position_index: State index of each axis' position.
         velocity_index: State index of each axis' velocity.
         further: (name, unit) of the states that follow position and velocity in each axis.
+        n_gusts: Number of gusts, the last states: one an axis, or none.
     """
     states = [(f"state {index}", "") for index in range(n_x)]
     for axis, position, velocity in zip(axes, position_index, velocity_index, strict=True):
         states[position], states[velocity] = (f"{axis} position", "m"), (f"{axis} velocity", "m/s")
         for index, (name, unit) in enumerate(further, start=velocity + 1):
             states[index] = (f"{axis} {name}", unit)
+    for axis, index in zip(axes, range(n_x - n_gusts, n_x), strict=False):
+        states[index] = (f"{axis} gust", "m/s²")
     rows = tuple(_name_row(number, row, states) for number, row in enumerate(c_x))
     return ConstraintNames(tuple(states), rows, tuple(axes))
 

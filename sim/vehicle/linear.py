@@ -83,11 +83,15 @@ def make_linear_model(plant: PlantConfig) -> LinearModel:
         axis_states = plant.states_per_axis
         if plant.model == "drag-lag":
             flow, deviations = _drag_lag_flow(plant), np.array(plant.wind_std_mps2)
+            if plant.gust_mps2:
+                # Gusts of unit time constant under noise held over Δt: Var h = Var n tanh(Δt / 2T)
+                spread = np.sqrt(np.tanh(0.5 * plant.dt_s / np.array(plant.gust_s)))
+                deviations = np.append(deviations, np.array(plant.gust_mps2) / spread)
         else:
             flow = _velocity_reference_flow(plant)
             drift = np.array(plant.force_drift_mps2_rts) / np.sqrt(plant.dt_s)
             deviations = np.column_stack([plant.wind_std_mps2, plant.input_std_mps2, drift]).ravel()
-        a, b, e = _split(expm(flow * plant.dt_s), axis_states * n, n)
+        a, b, e = _split(expm(flow * plant.dt_s), axis_states * n + len(plant.gust_mps2), n)
         w = np.diag(np.square(deviations))
         position, velocity, gain = (
             tuple(range(0, axis_states * n, axis_states)),
@@ -126,17 +130,25 @@ def _find_down_force(plant: PlantConfig, flow: Array, velocity_index: tuple[int,
 
 
 def _drag_lag_flow(plant: PlantConfig) -> Array:
-    """Return the continuous-time generator of p' = v, v' = a - c v + w, T a' = g u - a for each axis."""
+    """Return the continuous-time generator of p' = v, v' = a - c v + w + h, T a' = g u - a for each axis.
+
+    The gusts h, with T_h h' = n - h, follow the states of all axes, and their noise n follows w.
+    """
     n = len(plant.axes)
     axis = [
         np.array([[0.0, 1.0, 0.0], [0.0, -c, 1.0], [0.0, 0.0, -1.0 / lag]])
         for c, lag in zip(plant.drag_1ps, plant.lag_s, strict=True)
     ]
-    flow = np.zeros((5 * n, 5 * n))
+    gusts = len(plant.gust_s)
+    n_x = 3 * n + gusts
+    flow = np.zeros((n_x + 2 * n + gusts, n_x + 2 * n + gusts))
     flow[: 3 * n, : 3 * n] = block_diag(*axis)
     for i, (gain, lag) in enumerate(zip(plant.gain, plant.lag_s, strict=True)):
-        flow[3 * i + 2, 3 * n + i] = gain / lag
-        flow[3 * i + 1, 4 * n + i] = 1.0
+        flow[3 * i + 2, n_x + i] = gain / lag
+        flow[3 * i + 1, n_x + n + i] = 1.0
+    for i, time_s in enumerate(plant.gust_s):
+        flow[3 * i + 1, 3 * n + i] = 1.0
+        flow[3 * n + i, [3 * n + i, n_x + 2 * n + i]] = -1.0 / time_s, 1.0 / time_s
     return flow
 
 

@@ -29,6 +29,7 @@ from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import Plant
 from uavctl.wiring.controller import build_flight_design, build_plant, build_problem, build_solver
 from uavctl.wiring.link import build_ages
+from uavctl.wiring.rest import build_state_bounds, pad_state
 
 if TYPE_CHECKING:
     import pandas
@@ -101,9 +102,8 @@ _SUFFIXES = {"m": "_m", "m/s": "_mps", "m/s²": "_mps2"}
 def list_signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
     """Return the states and the inputs of a configuration's plant, in order."""
     model = build_plant(config)
-    states = name_constraints(
-        (), model.n_x, model.axes, model.position_index, model.velocity_index, model.extra_states
-    ).states
+    indices = model.position_index, model.velocity_index
+    states = name_constraints((), model.n_x, model.axes, *indices, model.extra_states, len(model.gust_mps2)).states
     unit = "" if config.plant.model == "matrices" else "m/s²"
     inputs = [(f"{axis} input", unit) for axis in model.axes] or [(f"input {i}", "") for i in range(model.n_u)]
     signal_groups = (
@@ -116,7 +116,8 @@ def list_signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]
 def get_limits(config: Config) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
     """Return lower and upper limit of each state and of each input; infinite without a limit."""
     sets = config.sets
-    states = list(zip(sets.state_lower, sets.state_upper, strict=True))
+    lower, upper = build_state_bounds(sets, build_plant(config))
+    states = list(zip(lower.tolist(), upper.tolist(), strict=True))
     return states, list(zip(sets.input_lower, sets.input_upper, strict=True))
 
 
@@ -157,9 +158,8 @@ def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> 
     """
     loaded = resolve_config(config)
     design, solver = _build_cached_solver(loaded)
-    n_x = design.plant.n_x
-    target_state = design.target if target is None else make_state(target, n_x)
-    answer = solver.solve(0, make_state(state, n_x), target_state)
+    target_state = design.target if target is None else make_state(target, design.plant)
+    answer = solver.solve(0, make_state(state, design.plant), target_state)
     return SolvedPlan(**msgspec.structs.asdict(answer), config=loaded)
 
 
@@ -169,8 +169,8 @@ def _build_cached_solver(config: Config) -> tuple[AnyDesign, Solver]:
     return design, build_solver(design, config)
 
 
-def make_state(value: ArrayLike, n_x: int) -> Array:
-    """Return a state (n_x,) from the value of a caller.
+def make_state(value: ArrayLike, plant: Plant) -> Array:
+    """Return a state (n_x,) from the value of a caller, who may leave out gusts: they are zero then.
 
     Raises:
         UsageError: It is not n_x finite numbers.
@@ -179,8 +179,9 @@ def make_state(value: ArrayLike, n_x: int) -> Array:
         state = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         state = np.empty(0)
-    if state.shape != (n_x,) or not np.isfinite(state).all():
-        raise UsageError(f"{value!r} is not a state of this plant; give {n_x} finite numbers")
+    state = pad_state(state, plant) if state.ndim == 1 else state
+    if state.shape != (plant.n_x,) or not np.isfinite(state).all():
+        raise UsageError(f"{value!r} is not a state of this plant; give {plant.n_x} finite numbers")
     return state
 
 
@@ -221,7 +222,7 @@ class SteppedController:
         if not 0 <= age_steps <= step:
             raise UsageError(f"a packet of step {step} cannot be {age_steps} steps old; give 0 to {step}")
         if state is not None:
-            reported_state = make_state(state, plant.n_x)
+            reported_state = make_state(state, plant)
             if step - age_steps > self._newest:
                 self._newest, self._state = step - age_steps, reported_state
         elif not step:
@@ -419,7 +420,7 @@ def simulate(
     from uavctl.lab.campaign.tasks import Task, fly_task
 
     loaded = resolve_config(config)
-    start_state = () if start is None else tuple(make_state(start, build_plant(loaded).n_x).tolist())
+    start_state = () if start is None else tuple(make_state(start, build_plant(loaded)).tolist())
     recipe, setting = make_cell(
         loaded, controller, runs=runs, steps=steps, master=seed, start=start_state, measured=measured
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Annotated, Literal
 
 import msgspec
@@ -27,6 +27,7 @@ from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.design import AnyDesign, ConditionedDesign, make_conditioned_record
 from uavctl.smpc.hahn_stursberg.design import Design, design_record
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
+from uavctl.smpc.plant import Plant
 from uavctl.wiring.controller import (
     build_conditioned,
     build_controller,
@@ -38,6 +39,7 @@ from uavctl.wiring.controller import (
 )
 from uavctl.wiring.mission import build_names
 from uavctl.wiring.rehearsal import RehearsalResult, rehearse
+from uavctl.wiring.rest import pad_state
 
 
 def report_gains(common: Common) -> int:
@@ -230,7 +232,7 @@ def solve(
     loaded = common.with_overrides([] if method is None else [f"solver.method={method}"]).load()
     with locate_design_errors(loaded):
         design = build_flight_design(loaded.config)
-        x = parse_state(state, design.plant.n_x)
+        x = parse_state(state, design.plant)
         solver = build_solver(design, loaded.config)
     begin_s = time.perf_counter()
     answer = solver.solve(0, x, design.target)
@@ -241,8 +243,8 @@ def solve(
     return 0 if answer.status is SolveStatus.OPTIMAL else 1
 
 
-def parse_state(text: str, n_x: int) -> Array:
-    """Parse a state (n_x,) of the command line.
+def parse_state(text: str, plant: Plant) -> Array:
+    """Parse a state (n_x,) of the command line; gusts may be left out.
 
     Raises:
         UsageError: It is not n_x finite numbers.
@@ -251,9 +253,10 @@ def parse_state(text: str, n_x: int) -> Array:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != n_x or not all(map(math.isfinite, numbers)):
-        raise UsageError(f"--state {text}: is not a state of this plant; give {n_x} numbers, joined by commas")
-    return np.array(numbers)
+    state = pad_state(np.array(numbers), plant)
+    if state.size != plant.n_x or not np.isfinite(state).all():
+        raise UsageError(f"--state {text}: is not a state of this plant; give {plant.n_x} numbers, joined by commas")
+    return state
 
 
 def make_solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
@@ -290,7 +293,7 @@ def make_plan_table(answer: Answer, design: AnyDesign) -> WideTable:
     """Return the plan as a table, a row for each stage; the columns of an axis and the back-offs are groups."""
     axes, count = design.plant.axes, len(answer.states)
     inputs = [f"u_{axis[0]}" for axis in axes] if axes else [f"u{i}" for i in range(design.plant.n_u)]
-    names = [*make_state_names(design.plant.n_x, axes), *inputs]
+    names = [*make_state_names(design.plant), *inputs]
     values = [*answer.states.T, *answer.inputs.T]
     groups: dict[str, list[Column]] = {}
     for name, stage_values in zip(names, values, strict=True):
@@ -302,12 +305,14 @@ def make_plan_table(answer: Answer, design: AnyDesign) -> WideTable:
     return WideTable(Column("t", [str(t) for t in range(count)]), [*groups.values(), backoffs])
 
 
-def make_state_names(n_x: int, axes: Sequence[str]) -> list[str]:
-    """Return the names of the states, axis by axis: position, velocity, acceleration; numbers for other plants."""
-    states_per_axis, remainder = divmod(n_x, len(axes)) if axes else (n_x, 0)
+def make_state_names(plant: Plant) -> list[str]:
+    """Return the names of the states: position, velocity, acceleration of each axis, then gusts; else numbers."""
+    axes, count = plant.axes, plant.gusts.start
+    states_per_axis, remainder = divmod(count, len(axes)) if axes else (count, 0)
     if not axes or remainder or states_per_axis > len("pva"):
-        return [f"x{i}" for i in range(n_x)]
-    return [f"{letter}_{axis[0]}" for axis in axes for letter in "pva"[:states_per_axis]]
+        return [f"x{i}" for i in range(plant.n_x)]
+    names = [f"{letter}_{axis[0]}" for axis in axes for letter in "pva"[:states_per_axis]]
+    return names + [f"g_{axis[0]}" for axis in axes[: len(plant.gust_mps2)]]
 
 
 def _make_column(heading: str, values: Iterable[float], rows: int) -> Column:

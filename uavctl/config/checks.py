@@ -205,6 +205,8 @@ def check_solver_fences(solver: SolverConfig, fences: Sequence[FenceConfig]) -> 
 _AXIS_KEYS: tuple[str, ...] = ("position_index", "velocity_index", "accel_per_input")
 _MATRIX_KEYS: tuple[str, ...] = ("a", "b", "e", "w", *_AXIS_KEYS)
 _DRAG_LAG_KEYS: tuple[str, ...] = ("drag_1ps", "lag_s", "gain", "wind_std_mps2")
+_GUST_KEYS: tuple[str, ...] = ("gust_mps2", "gust_s")  # of `drag-lag`, which does without them
+MAX_GUST_S = 10.0  # a gust that lasts longer is a bias of the filter
 _REFERENCE_KEYS: tuple[str, ...] = (
     "drag_1ps",
     "lag_s",
@@ -216,14 +218,17 @@ _REFERENCE_KEYS: tuple[str, ...] = (
     "force_drift_mps2_rts",
 )
 _KEYS = {"matrices": _MATRIX_KEYS, "drag-lag": _DRAG_LAG_KEYS, "velocity-reference": _REFERENCE_KEYS}
-_POSITIVE = ("lag_s", "gain", "position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2")
+_POSITIVE = ("lag_s", "gain", "position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2", "gust_s")
 _SUM_TOLERANCE = 1e-4  # shares are written rounded
 _MAX_TICKS_TRIED = 10_000
 _EIGENVALUE_TOLERANCE = 1e-9  # asymmetry and negative eigenvalues below this share of W's size are rounding
 
 
 def get_dimensions(plant: PlantConfig) -> tuple[int, int]:
-    """(n_x, n_u) that the other sections must fit; a plant without axes has as many inputs as B has columns."""
+    """(n_x, n_u) that the other sections must fit: gusts do not count.
+
+    A plant without axes has as many inputs as B has columns.
+    """
     n_u = len(plant.axes) or (len(plant.b[0]) if plant.b else 0)
     return (plant.states_per_axis * n_u or len(plant.a)), n_u
 
@@ -284,8 +289,28 @@ def _check_plant(plant: PlantConfig) -> Iterator[ConfigProblem]:
             yield ConfigProblem(
                 f"plant.{key}", f'has no meaning with model "{plant.model}"', "remove it, or change the model"
             )
+    yield from _check_gusts(plant)
     if not missing:
         yield from _check_matrices(plant) if plant.model == "matrices" else _check_axis_values(plant, required_keys)
+
+
+def _check_gusts(plant: PlantConfig) -> Iterator[ConfigProblem]:
+    given = [key for key in _GUST_KEYS if getattr(plant, key)]
+    if given and plant.model != "drag-lag":
+        yield ConfigProblem(
+            f"plant.{given[0]}", f'has no meaning with model "{plant.model}"', 'remove it, or take model "drag-lag"'
+        )
+    elif len(given) == 1:
+        (missing,) = set(_GUST_KEYS) - set(given)
+        yield ConfigProblem(f"plant.{missing}", f"is missing, and plant.{given[0]} needs it", "add it")
+    elif given:
+        yield from _check_axis_values(plant, _GUST_KEYS)
+    if max(plant.gust_s, default=0.0) > MAX_GUST_S:
+        yield ConfigProblem(
+            "plant.gust_s",
+            f"{max(plant.gust_s):g} s is more than {MAX_GUST_S:g}",
+            "leave such gusts to estimator.bias_drift",
+        )
 
 
 def _check_matrices(plant: PlantConfig) -> Iterator[ConfigProblem]:
@@ -375,6 +400,12 @@ def _check_cost(plant: PlantConfig, cost: CostConfig) -> Iterator[ConfigProblem]
 
 def _check_smpc(plant: PlantConfig, smpc: SmpcConfig) -> Iterator[ConfigProblem]:
     n_x, n_u = get_dimensions(plant)
+    if plant.gust_mps2 and not smpc.is_age_conditioned:
+        yield ConfigProblem(
+            "plant.gust_mps2",
+            'scheme "hahn-stursberg" takes no state that inputs do not move',
+            'remove gust_mps2 and gust_s, or set smpc.scheme = "age-conditioned"',
+        )
     if smpc.is_age_conditioned or smpc.tau is None or smpc.k_tau is None:
         return
     if smpc.horizon > MAX_PLANNED_HORIZON:

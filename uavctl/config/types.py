@@ -56,7 +56,8 @@ Delay = Annotated[int, Meta(le=60)]
 class PlantConfig(Section, frozen=True, kw_only=True):
     """The plant x(k+1) = A x + B u + E w, w ~ N(0, W).
 
-    `a` to `accel_per_input` belong to model `matrices`, `gain` to `drag-lag`, the last five to `velocity-reference`;
+    `a` to `accel_per_input` belong to model `matrices`, `gain` and gusts to `drag-lag`, the last five to
+    `velocity-reference`;
     `drag_1ps`, `lag_s` and `wind_std_mps2` to both of these.
     """
 
@@ -84,6 +85,16 @@ class PlantConfig(Section, frozen=True, kw_only=True):
     wind_std_mps2: Annotated[
         Floats, declare("standard deviation of the acceleration noise, constant over Δt", "m/s²", length=3)
     ] = ()
+    gust_mps2: Annotated[
+        Floats,
+        declare(
+            "standard deviation of gusts that last longer than Δt, as accelerations; their states have no entry in "
+            "`[sets]` and `[cost]`; 0: none in this axis",
+            "m/s²",
+            length=3,
+        ),
+    ] = ()
+    gust_s: Annotated[Floats, declare("time constant of the gusts, at most 10", "s", length=3)] = ()
     dead_time_s: Annotated[float, declare("time from sending an input until it acts, all axes", "s", 0, 1)] = 0.0
     position_1ps: Annotated[Floats, declare("position gain of the vehicle", "1/s", length=3)] = ()
     velocity_1ps: Annotated[Floats, declare("velocity gain of the vehicle", "1/s", length=3)] = ()
@@ -103,7 +114,10 @@ class PlantConfig(Section, frozen=True, kw_only=True):
 
     @property
     def states_per_axis(self) -> int:
-        """Number of states of an axis, position and velocity first; 0 where the matrices define it."""
+        """Number of states of an axis, position and velocity first; 0 where the matrices define it.
+
+        Gusts, the last states of the plant, are left out.
+        """
         return {"matrices": 0, "drag-lag": 3, "velocity-reference": 6}[self.model]
 
 

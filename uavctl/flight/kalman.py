@@ -4,7 +4,8 @@
 2. Prediction to any instant is exact, as the input u is piecewise constant. At a boundary of the grid w is drawn anew:
    mean 0, covariance W, independent of x.
 3. Where a bias d of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.estimate`). While others fly
-   the vehicle, what accelerates it is no bias: d is drawn anew at each boundary, from its initial distribution.
+   the vehicle, what accelerates it is no bias: d is drawn anew at each boundary, from its initial distribution. So are
+   the plant's gusts.
 4. Where the vehicle's inertial data are used, x is (x, d, b). They show the acceleration of each axis plus b, which
    comes and goes slowly: a bias of the sensors, and an attitude that is not quite level.
 5. Each update first asks whether inertial data may be used (`uavctl.flight.monitors.inertial`).
@@ -80,6 +81,8 @@ class Kalman:
     push_cov: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
     measured_z: Array  # measurement matrix of positions, then velocities, for z (2 n_axes, n_x + n_w)
     identity: Array  # of the size of z
+    gusts: slice  # slice of the plant's gusts among the states, empty without gusts
+    gust_mps2: Array  # their standard deviations in the long run (n_gusts,)
     # Largest bias that is flown against, of each input that has one [input units]; made from the others
     bias_bounds: tuple[float, ...] = field(init=False)
     bias: slice = field(init=False)  # slice of the biases among the states; made from the others
@@ -145,6 +148,8 @@ def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Ka
         push_cov=parameters.bias_max**2 * push @ push.T,
         measured_z=identity[measured_index],
         identity=identity,
+        gusts=plant.gusts,
+        gust_mps2=np.array(plant.gust_mps2),
     )
 
 
@@ -217,8 +222,8 @@ def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_
         cov += half
         if stop_ns == boundary_ns:
             _draw_disturbance(kalman, mean, cov, _uses_inertial(belief.inertial, stop_ns))
-            if u is None and kalman.n_bias:
-                _reset_bias(kalman, mean, cov)
+            if u is None:
+                _reset_pushes(kalman, mean, cov)
         now_ns = stop_ns
     return Belief(now_ns, belief.captured_ns, mean, cov, belief.inertial)
 
@@ -237,14 +242,21 @@ def _uses_inertial(trust: InertialTrust, at_ns: int) -> bool:
     return is_recent and trust.distrusted_ns is None
 
 
-def _reset_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
-    """Set the biases of a belief to their initial distribution, in place."""
-    bias = kalman.bias
-    mean[bias] = 0.0
-    # d ~ N(0, (d_max / 4)²), independent of all else
-    cov[bias] = 0.0
-    cov[:, bias] = 0.0
-    cov[bias, bias] = np.eye(kalman.n_bias) * (0.25 * kalman.parameters.bias_max) ** 2
+def _reset_pushes(kalman: Kalman, mean: Array, cov: Array) -> None:
+    """Set biases and gusts of a belief to their initial distributions, in place."""
+    if kalman.n_bias:
+        # d ~ N(0, (d_max / 4)²)
+        _redraw(mean, cov, kalman.bias, np.eye(kalman.n_bias) * (0.25 * kalman.parameters.bias_max) ** 2)
+    if kalman.gust_mps2.size:
+        _redraw(mean, cov, kalman.gusts, np.diag(np.square(kalman.gust_mps2)))
+
+
+def _redraw(mean: Array, cov: Array, states: slice, states_cov: Array) -> None:
+    """Set some states to zero mean and a covariance, independent of all else, in place."""
+    mean[states] = 0.0
+    cov[states] = 0.0
+    cov[:, states] = 0.0
+    cov[states, states] = states_cov
 
 
 def make_first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
@@ -259,8 +271,7 @@ def make_first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
     cov = np.zeros((n_x + n_w, n_x + n_w))
     cov[:n_x, :n_x] = np.diag(diagonal)
     _draw_disturbance(kalman, mean, cov, uses_inertial=False)
-    if kalman.n_bias:
-        _reset_bias(kalman, mean, cov)
+    _reset_pushes(kalman, mean, cov)
     if kalman.n_inertial:
         sensor_bias = slice(n_x - kalman.n_inertial, n_x)
         cov[sensor_bias, sensor_bias] = np.eye(kalman.n_inertial) * kalman.parameters.inertial_bias_mps2**2

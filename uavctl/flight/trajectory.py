@@ -48,6 +48,9 @@ def follow_positions(plant: Plant, positions_m: Array, velocities_mps: Array | N
         velocities_mps: (n, 3) [m/s], or None.
 
     """
+    if plant.gust_mps2:  # a motion has none
+        calm = follow_positions(plant.without_gusts(), positions_m, velocities_mps)
+        return PlantMotion(np.pad(calm.states, ((0, 0), (0, len(plant.gust_mps2)))), calm.inputs)
     n, n_x, n_u, dt_s = len(positions_m), plant.n_x, plant.n_u, plant.dt_s
     columns = [AXES.index(axis) for axis in plant.axes]
     position = np.eye(n_x)[list(plant.position_index)]

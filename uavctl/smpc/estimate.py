@@ -90,7 +90,8 @@ def force_jump(plant: Plant) -> Array:
     jump = np.zeros((plant.n_x, plant.n_u))
     for velocity in plant.velocity_index:
         # v' = … + a,  a' = s a + p u with s < 0:  J = -p / s
-        lagging = [i for i in np.flatnonzero(slope[velocity]) if i != velocity and i not in plant.position_index]
+        others = (velocity, *plant.position_index, *range(plant.n_x)[plant.gusts])
+        lagging = [i for i in np.flatnonzero(slope[velocity]) if i not in others]
         if len(lagging) == 1 and slope[lagging[0], lagging[0]] < 0.0:
             jump[lagging[0]] = -push[lagging[0]] / slope[lagging[0], lagging[0]]
     return jump

@@ -2,7 +2,7 @@
 
 1. x(k+1) = A x(k) + B u(k) + E w(k), w(k) ~ N(0, W), with u and w held over Δt.
 2. Parts of a step: [[A, B, E], [0, I]] = exp(G Δt). G is its matrix logarithm, computed in balanced units.
-3. `drag_lag`: axes with drag and a lag of the acceleration.
+3. `drag_lag`: axes with drag and a lag of the acceleration, and gusts of first order.
 4. `velocity_reference`: an autopilot integrates the acceleration setpoint into a velocity and a position that its own
    loops hold. Each axis moves under a force f (wind, an error of the hover thrust), a random walk f' = n:
 
@@ -26,7 +26,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -143,6 +143,7 @@ class Plant:
     accel_per_input: Array
     # (name, unit) of the states after position and velocity in each axis; empty where unknown
     extra_states: tuple[tuple[str, str], ...] = field(default=(), metadata=DESCRIPTION)
+    gust_mps2: tuple[float, ...] = field(default=(), metadata=DESCRIPTION)  # deviations of gusts, the last states
     _accel_map: Array = field(init=False, repr=False)
     _columns: tuple[int, ...] = field(init=False, repr=False)  # place of each axis in a vector of all three
     _units: Array = field(init=False, repr=False)  # of x, u and w, in which all numbers are of similar size
@@ -197,6 +198,18 @@ class Plant:
         augmented = (exponential(self._generator * dt_s) * (self._units[:, None] / self._units))[: self.n_x]
         a, b, e = np.split(augmented, [self.n_x, self.n_x + self.n_u], axis=1)
         return a, b, e
+
+    @property
+    def gusts(self) -> slice:
+        """Slice of the states that are gusts, the last ones; empty without gusts."""
+        return slice(self.n_x - len(self.gust_mps2), self.n_x)
+
+    def without_gusts(self) -> Plant:
+        """Return the plant without its gusts, whose noise is the last of the disturbances."""
+        n_x, n_w = self.gusts.start, self.n_w - len(self.gust_mps2)
+        return replace(
+            self, a=self.a[:n_x, :n_x], b=self.b[:n_x], e=self.e[:n_x, :n_w], w=self.w[:n_w, :n_w], gust_mps2=()
+        )
 
     @property
     def slope(self) -> tuple[Array, Array]:
@@ -280,24 +293,36 @@ def drag_lag(
     wind_std_mps2: Sequence[float],
     dt_s: float,
     axes: tuple[str, ...],
+    gust_mps2: Sequence[float] = (),
+    gust_s: Sequence[float] = (),
 ) -> Plant:
     """Make axes with p' = v, v' = a - c v + w, T a' = g u - a, with input and disturbance held over Δt.
+
+    With gusts v' has the further term h, with h' = (n - h) / T_h and n held over Δt. The gusts are the last states, so
+    all other states have the same places with and without them.
 
     Args:
         drag_1ps: Drag c of each axis [1/s].
         lag_s: Acceleration lag T of each axis [s].
         wind_std_mps2: Standard deviation of w of each axis [m/s²].
         dt_s: Δt [s].
+        gust_mps2: Standard deviation of h of each axis in the long run [m/s²]; empty: there are no gusts.
+        gust_s: Time constant T_h of each axis [s].
 
     Raises:
-        DesignError: Not one number for each axis, or a lag that is not positive.
+        DesignError: Not one number for each axis, or a lag or time constant that is not positive.
     """
     numbers = {"drag_1ps": drag_1ps, "lag_s": lag_s, "gain": gain, "wind_std_mps2": wind_std_mps2}
+    if gust_mps2 or gust_s:
+        numbers |= {"gust_mps2": gust_mps2, "gust_s": gust_s}
     for key, values in numbers.items():
         if len(values) != len(axes):
             raise DesignError(f"plant.{key}", f"{len(values)} numbers for {len(axes)} axes", "give one an axis")
-    if min(lag_s, default=1.0) <= 0.0:
-        raise DesignError("plant.lag_s", f"{list(lag_s)} has a lag that is not positive", "give times above 0")
+    for key, name, times_s in (("lag_s", "lag", lag_s), ("gust_s", "time constant", gust_s)):
+        if min(times_s, default=1.0) <= 0.0:
+            raise DesignError(
+                f"plant.{key}", f"{list(times_s)} has a {name} that is not positive", "give times above 0"
+            )
     parts = []
     for drag, lag, axis_gain in zip(drag_1ps, lag_s, gain, strict=True):
         # (p, v, a, u, w)' = M (p, v, a, u, w)
@@ -306,7 +331,7 @@ def drag_lag(
         augmented[1, 1:] = [-drag, 1.0, 0.0, 1.0]
         augmented[2, 2:4] = [-1.0 / lag, axis_gain / lag]
         parts.append(exponential(augmented * dt_s)[:3])
-    return Plant(
+    plant = Plant(
         a=block_diag(*(part[:, :3] for part in parts)),
         b=block_diag(*(part[:, 3:4] for part in parts)),
         e=block_diag(*(part[:, 4:] for part in parts)),
@@ -317,6 +342,36 @@ def drag_lag(
         velocity_index=tuple(range(1, 3 * len(axes), 3)),
         accel_per_input=np.ones(len(axes)),
         extra_states=(("acceleration", "m/s²"),),
+    )
+    return _add_gusts(plant, drag_1ps, gust_mps2, gust_s) if gust_mps2 else plant
+
+
+def _add_gusts(plant: Plant, drag_1ps: Sequence[float], gust_mps2: Sequence[float], gust_s: Sequence[float]) -> Plant:
+    """Return a plant of `drag_lag` with gusts: states (x, h), disturbances (w, n)."""
+    count, n_x = len(gust_mps2), plant.n_x
+    of_gust, of_noise = np.zeros((n_x, count)), np.zeros((n_x, count))
+    keep = np.exp(-plant.dt_s / np.array(gust_s))
+    for axis, (drag, time_s) in enumerate(zip(drag_1ps, gust_s, strict=True)):
+        # (p, v, h, n)' = M (p, v, h, n)
+        augmented = np.zeros((4, 4))
+        augmented[0, 1] = 1.0
+        augmented[1, 1:3] = [-drag, 1.0]
+        augmented[2, 2:] = [-1.0 / time_s, 1.0 / time_s]
+        rows = [plant.position_index[axis], plant.velocity_index[axis]]
+        of_gust[rows, axis], of_noise[rows, axis] = exponential(augmented * plant.dt_s)[:2, 2:].T
+    # h(k+1) = φ h(k) + (1 - φ) n(k), φ = exp(-Δt/T_h), Var n = std² (1 + φ) / (1 - φ)
+    return Plant(
+        a=np.block([[plant.a, of_gust], [np.zeros((count, n_x)), np.diag(keep)]]),
+        b=np.vstack([plant.b, np.zeros((count, plant.n_u))]),
+        e=np.block([[plant.e, of_noise], [np.zeros((count, plant.n_w)), np.diag(1.0 - keep)]]),
+        w=block_diag(plant.w, np.diag(np.square(gust_mps2) * (1.0 + keep) / (1.0 - keep))),
+        dt_s=plant.dt_s,
+        axes=plant.axes,
+        position_index=plant.position_index,
+        velocity_index=plant.velocity_index,
+        accel_per_input=plant.accel_per_input,
+        extra_states=plant.extra_states,
+        gust_mps2=tuple(gust_mps2),
     )
 
 

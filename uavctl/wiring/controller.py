@@ -37,7 +37,7 @@ from uavctl.smpc.sets import Polytope
 from uavctl.wiring.link import build_ages, build_delayed_link, compute_late_steps, compute_promised_probability
 from uavctl.wiring.mission import build_mission, build_names, build_reference_limits
 from uavctl.wiring.outside import build_outside_solver, compute_code_id, compute_controller_id
-from uavctl.wiring.rest import check_axes, compute_target_equilibrium
+from uavctl.wiring.rest import build_state_bounds, build_weights, check_axes, compute_target_equilibrium
 
 # The paper's scheme is loaded only if it flies: loading it takes a tenth of the time of all other imports.
 if TYPE_CHECKING:
@@ -61,7 +61,8 @@ def build_plant(config: Config) -> Plant:
     """
     plant = config.plant
     if plant.model == "drag-lag":
-        return drag_lag(plant.drag_1ps, plant.lag_s, plant.gain, plant.wind_std_mps2, plant.dt_s, plant.axes)
+        numbers = plant.drag_1ps, plant.lag_s, plant.gain, plant.wind_std_mps2
+        return drag_lag(*numbers, plant.dt_s, plant.axes, plant.gust_mps2, plant.gust_s)
     if plant.model == "velocity-reference":
         columns = (getattr(plant, key) for key in VelocityReferenceAxis._fields)
         return velocity_reference(
@@ -153,13 +154,14 @@ def build_problem(config: Config) -> ControlProblem:
     Raises:
         DesignError: The plant is not valid, or cannot rest at the target.
     """
-    plant, sets = build_plant(config), config.sets
-    q_x, q_u = np.diag(config.cost.state), np.diag(config.cost.input)
+    plant = build_plant(config)
+    q_x, q_u = build_weights(config.cost, plant)
+    state_lower, state_upper = build_state_bounds(config.sets, plant)
     target, u_target = compute_target_equilibrium(config, plant)
     lower, upper = build_input_bounds(config, plant)
     return ControlProblem(
         plant=plant,
-        state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
+        state_set=Polytope.from_box(state_lower.tolist(), state_upper.tolist()),
         input_set=Polytope.from_box(lower.tolist(), upper.tolist()),
         q_x=q_x,
         q_u=q_u,
@@ -357,9 +359,10 @@ def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
     outside_m = [
         envelope.outside_m or max(0.1 * size if math.isfinite(size) else 0.0, MIN_OUTSIDE_M) for size in sizes_m
     ]
-    # Velocity change by one step's disturbance, as an acceleration over the step: E W E' / dt².
+    # Velocity change by one step's disturbance, as an acceleration over the step: E W E' / dt²; and gusts
     velocity_cov = plant.e[list(plant.velocity_index)] @ plant.w @ plant.e[list(plant.velocity_index)].T
     std_mps2 = float(np.sqrt(np.diagonal(velocity_cov).max())) / plant.dt_s
+    std_mps2 = math.hypot(std_mps2, max(plant.gust_mps2)) if plant.gust_mps2 else std_mps2
     unexplained_mps2 = envelope.unexplained_mps2 or max(ENVELOPE_SIGMA * std_mps2, MIN_UNEXPLAINED_MPS2)
     lags_s: dict[str, float] = {}
     if config.plant.lag_s:

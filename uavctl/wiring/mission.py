@@ -78,6 +78,7 @@ def build_names(design: AnyDesign) -> ConstraintNames:
         plant.position_index,
         plant.velocity_index,
         plant.extra_states,
+        len(plant.gust_mps2),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uavctl.arrays import Array
-from uavctl.config.types import Config
+from uavctl.config.types import Config, CostConfig, SetsConfig
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import find_equilibria
@@ -29,6 +29,25 @@ def check_axes(config: Config) -> None:
         )
 
 
+def build_state_bounds(sets: SetsConfig, plant: Plant) -> tuple[Array, Array]:
+    """Return the least and the largest state (n_x,); gusts have no limits."""
+    free = np.full(len(plant.gust_mps2), np.inf)
+    return np.append(sets.state_lower, -free), np.append(sets.state_upper, free)
+
+
+def build_weights(cost: CostConfig, plant: Plant) -> tuple[Array, Array]:
+    """Return Q_x (n_x, n_x), zero for gusts, and Q_u (n_u, n_u)."""
+    return np.diag([*cost.state, *(0.0 for _ in plant.gust_mps2)]), np.diag(cost.input)
+
+
+def pad_state(state: Array, plant: Plant) -> Array:
+    """Return states (…, n_x) with gusts; states that are given without them have none."""
+    missing = plant.n_x - state.shape[-1]
+    if not missing or missing != len(plant.gust_mps2):
+        return state
+    return np.concatenate([state, np.zeros((*state.shape[:-1], missing))], axis=-1)
+
+
 def compute_target_equilibrium(config: Config, plant: Plant) -> tuple[Array, Array]:
     """Return the target state (n_x,), and the input (n_u,) within its limits that holds it.
 
@@ -39,12 +58,11 @@ def compute_target_equilibrium(config: Config, plant: Plant) -> tuple[Array, Arr
     """
     sets = config.sets
     rest_set = find_equilibria(
-        plant.a, plant.b, np.diag(config.cost.state), np.diag(config.cost.input), np.array(plant.position_index, int)
+        plant.a, plant.b, *build_weights(config.cost, plant), np.array(plant.position_index, int)
     )
     state = plant.equilibrium(config.target.position_m)
-    low_x, high_x, low_u, high_u = map(
-        np.array, (sets.state_lower, sets.state_upper, sets.input_lower, sets.input_upper)
-    )
+    low_x, high_x = build_state_bounds(sets, plant)
+    low_u, high_u = np.array(sets.input_lower), np.array(sets.input_upper)
     u = rest_set.u_eq @ state[rest_set.held]
     if not plant.axes and not (_is_within(state, low_x, high_x) and _is_within(u, low_u, high_u)):
         middle = _find_middle(

@@ -47,7 +47,7 @@ from uavctl.wiring.controller import (
     make_start_state,
     require_value,
 )
-from uavctl.wiring.rest import check_axes
+from uavctl.wiring.rest import check_axes, pad_state
 
 _STUDENT_DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
 
@@ -139,12 +139,12 @@ def draw_conditions(setting: CellSetting, first: int, runs: int) -> RunCondition
 
 def get_start_state(spec: CampaignSpec, base: Config) -> Array:
     """Return the state in which runs start (n_x,); with a box, its middle."""
+    plant = build_plant(base)
     if spec.start:
-        return np.array(spec.start, dtype=np.float64)
+        return pad_state(np.array(spec.start, dtype=np.float64), plant)
     if spec.start_box:
-        middle: Array = np.array(spec.start_box, dtype=np.float64).mean(axis=0)
-        return middle
-    return make_start_state(base, build_plant(base))
+        return pad_state(np.array(spec.start_box, dtype=np.float64).mean(axis=0), plant)
+    return make_start_state(base, plant)
 
 
 def _draw_start_states(setting: CellSetting, first: int, runs: int) -> Array:
@@ -152,7 +152,7 @@ def _draw_start_states(setting: CellSetting, first: int, runs: int) -> Array:
     spec = setting.spec
     if not spec.start_box:
         return np.tile(get_start_state(spec, setting.base), (runs, 1))
-    lower, upper = np.array(spec.start_box, dtype=np.float64)
+    lower, upper = pad_state(np.array(spec.start_box, dtype=np.float64), build_plant(setting.base))
     draws = draw_uniform(Stream.START, spec.master, first, runs, (lower.size,))
     return np.asarray(lower + (upper - lower) * draws, dtype=np.float64)
 

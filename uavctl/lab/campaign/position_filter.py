@@ -17,7 +17,7 @@ class FilterBelief:
 
     plant: Plant  # the plant that it believes in
     position_std_m: float  # standard deviation of a position, each axis [m]
-    initial_std: float  # standard deviation of the states that the first position does not show
+    initial_std: float  # standard deviation of the states that the first position does not show, but for gusts
 
 
 class PositionFilter:
@@ -42,7 +42,9 @@ class PositionFilter:
         self._index = list(plant.position_index)
         self._position_cov = np.eye(len(self._index)) * belief.position_std_m**2
         self._max_delay_steps = int((known_steps - np.arange(steps))[known_steps < steps].max(initial=0))
-        mean, cov = np.zeros((runs, plant.n_x)), np.tile(np.eye(plant.n_x) * belief.initial_std**2, (runs, 1, 1))
+        variances = np.full(plant.n_x, belief.initial_std**2)
+        variances[plant.gusts] = np.square(plant.gust_mps2)
+        mean, cov = np.zeros((runs, plant.n_x)), np.tile(np.diag(variances), (runs, 1, 1))
         self._before = {0: (mean, cov)}  # of a step, without its own position
         self._after = mean, cov  # of the newest step, with it
         self._positions: dict[int, Array] = {}

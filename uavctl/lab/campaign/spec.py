@@ -359,14 +359,21 @@ def find_plant_problems(config: Config, overrides: LocatedOverrides, key: str) -
 
 
 def _has_other_dimensions(base: Config, config: Config) -> bool:
-    return get_dimensions(base.plant) != get_dimensions(config.plant) or base.plant.dt_s != config.plant.dt_s
+    has_other_gusts = len(base.plant.gust_mps2) != len(config.plant.gust_mps2)
+    has_other_sizes = get_dimensions(base.plant) != get_dimensions(config.plant)
+    return has_other_sizes or has_other_gusts or base.plant.dt_s != config.plant.dt_s
 
 
 def _describe_other_dimensions(key: str, base: Config, config: Config) -> ConfigProblem:
     """Return the problem that a plant has other sizes or another step than the base configuration's."""
-    sizes = (f"n_x, n_u = {get_dimensions(plant)}, Δt = {plant.dt_s:g} s" for plant in (config.plant, base.plant))
+    sizes = (
+        f"n_x, n_u = {get_dimensions(plant)}, {len(plant.gust_mps2)} gusts, Δt = {plant.dt_s:g} s"
+        for plant in (config.plant, base.plant)
+    )
     return ConfigProblem(
-        key, f"the plant has {' where the configuration has '.join(sizes)}", "keep its sizes and its step"
+        key,
+        f"the plant has {' where the configuration has '.join(sizes)}",
+        "keep its sizes and its step; a gust of 0 is none",
     )
 
 
