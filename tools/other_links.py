@@ -7,7 +7,8 @@ the first 200 steps and after them, with its 95 % interval, and the mean cost of
 With `--before 600` the ages of so many steps before the flight are counted too, and further cells are flown whose link
 on the ground is another one.
 
-With `--design 0.6` the scheme is designed for 60 % independent losses.
+With `--design 0.6` the scheme is designed for 60 % independent losses, with `--late 2` for positions 2 steps late, and
+with `--gust 0.8` for disturbances of which each step keeps 0.8: the gust is a state, estimated from the known states.
 
     python tools/other_links.py [--axes 2] [--runs 8] [--steps 2200] [--seed 1] [--budgets configured] [--cells AR]
 """
@@ -17,7 +18,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,8 +35,8 @@ from uavctl.smpc.conditioned.adaptation import (
 )
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL
-from uavctl.smpc.link import bernoulli
-from uavctl.smpc.nominal import ControlProblem, propagate_covariance
+from uavctl.smpc.link import RunLengthAges, bernoulli
+from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
@@ -115,6 +116,60 @@ def make_problem(axes: int) -> ControlProblem:
     )
 
 
+def add_gusts(problem: ControlProblem, kept: float) -> ControlProblem:
+    """Return the problem whose last states are the disturbances of the step before; each step keeps a share."""
+    plant, zeros = problem.plant, np.zeros((problem.plant.n_w, problem.plant.n_x))
+    eye: Array = np.eye(plant.n_w)
+    gusty = replace(
+        plant,
+        # w(k) = φ w(k-1) + n(k), Var n = (1 - φ²) W
+        a=np.block([[plant.a, kept * plant.e], [zeros, kept * eye]]),
+        b=np.vstack([plant.b, np.zeros((plant.n_w, plant.n_u))]),
+        e=np.vstack([plant.e, eye]),
+        w=(1.0 - kept**2) * plant.w,
+    )
+    rows = np.pad(problem.state_set.c, ((0, 0), (0, plant.n_w)))
+    return replace(
+        problem,
+        plant=gusty,
+        state_set=Polytope(rows, problem.state_set.b),
+        q_x=np.pad(problem.q_x, ((0, plant.n_w), (0, plant.n_w))),
+        target=np.pad(problem.target, (0, plant.n_w)),
+    )
+
+
+class Knowledge:
+    """State and covariance of its error, by positions and velocities that are known exactly.
+
+    Args:
+        believed: Plant of the design; its last states may be gusts.
+        x: First state, without gusts.
+    """
+
+    def __init__(self, believed: Plant, x: Array, gust_cov: Array) -> None:
+        self._plant, self._n_known = believed, x.size
+        self._noise = believed.e @ believed.w @ believed.e.T
+        gusts = believed.n_x - x.size
+        self.mean, self.cov = np.pad(x, (0, gusts)), np.zeros_like(self._noise)
+        self.cov[x.size :, x.size :] = gust_cov[:gusts, :gusts]
+
+    def predict(self, inputs: Array) -> tuple[Array, Array]:
+        """Predict over the steps of some inputs (steps, n_u)."""
+        mean, cov, plant = self.mean, self.cov, self._plant
+        for u in inputs:
+            mean, cov = plant.a @ mean + plant.b @ u, plant.a @ cov @ plant.a.T + self._noise
+        return mean, cov
+
+    def learn(self, mean: Array, cov: Array, x: Array) -> None:
+        """Learn a state without gusts, where `mean` and `cov` were predicted."""
+        n = self._n_known
+        # K = P C' (C P C')⁺: one disturbance moves position and velocity, so C P C' is singular
+        gain = cov[:, :n] @ np.linalg.pinv(cov[:n, :n], rcond=1e-9, hermitian=True)
+        self.mean, self.cov = mean + gain @ (x - mean[:n]), cov - gain @ cov[:n]
+        self.mean[:n] = x
+        self.cov[np.abs(self.cov) < 1e-12] = 0.0  # rounding
+
+
 def draw_arrivals(loss: float, burst: float, steps: int, rng: np.random.Generator) -> Array:
     """Draw which positions arrive (steps,), on a two-state link that loses all in one state."""
     leave = 1.0 / burst if burst > 1.0 else 1.0 - loss
@@ -153,8 +208,8 @@ def fly(
 ) -> tuple[Array, Array]:
     """Fly one run by `risk.budgets`; return the flags of steps outside and the cost of each step."""
     adapts = budgets != "configured"
-    problem, plant = solver.problem, solver.problem.plant
-    covs = propagate_covariance(plant, steps)
+    axes = solver.problem.plant.n_u
+    problem, plant = make_problem(axes), make_problem(axes).plant
     shares, ages, loop = solver.age_shares, AgeRecord(), LoopState()
     arrived, noise = draw_run(cell, steps, problem, rng)
     if steps_before:
@@ -162,35 +217,35 @@ def fly(
         for is_there in draw_arrivals(*(cell.before or (cell.loss, cell.burst)), steps_before, rng):
             ages, silence = count_age(ages, silence + 1, shares), 0 if is_there else silence + 1
     lower, upper = problem.input_set.bounds
-    rows, sides, target = problem.state_set.c, problem.state_set.b, problem.target
+    rows, sides = solver.problem.state_set.c, solver.problem.state_set.b
+    target = problem.target
     x = target - np.array([2.0, 0.0] * plant.n_u)
     plan: Answer | None = None
     spread = SpreadState()
+    knowledge = Knowledge(solver.problem.plant, x, plant.w)
     states, inputs, begun, newest, before = [x], np.zeros((steps, plant.n_u)), 0, 0, 0
     outside, cost = np.zeros(steps), np.zeros(steps)
     for k in range(steps):
         captured = k - cell.late
         is_new = k == 0 or (captured >= 0 and bool(arrived[captured]))
         if is_new and captured > newest:
-            mean = states[newest]
-            for step in range(newest, captured):
-                mean = plant.a @ mean + plant.b @ inputs[step]
-            variances = covs[captured - newest].diagonal()[::2]
-            spread = count_innovation(spread, (states[captured] - mean)[::2].tolist(), variances.tolist())
+            mean, cov = knowledge.predict(inputs[newest:captured])
+            variances, innovation = cov.diagonal()[: plant.n_x : 2], states[captured] - mean[: plant.n_x]
+            spread = count_innovation(spread, innovation[::2].tolist(), variances.tolist())
+            knowledge.learn(mean, cov, states[captured])
             newest = captured
-        age, mean = k - newest, states[newest]
-        for step in range(newest, k):
-            mean = plant.a @ mean + plant.b @ inputs[step]
+        age = k - newest
+        mean, cov = knowledge.predict(inputs[newest:k])
         if k and adapts:
             ages = count_age(ages, before + 1, shares)
-            variances = np.einsum("mi,ij,mj->m", rows, covs[age], rows)
+            variances = np.einsum("mi,ij,mj->m", rows, cov, rows)
             is_behind = age >= HORIZON
             risk = compute_outside_risk(sides - rows @ mean, variances, spread.spread)
             keeps_away = plan is not None and plan.offset > 0.0
             loop = charge_risk(loop, risk, ALLOWED, keeps_away=keeps_away, is_behind_horizon=is_behind)
         before = age
         if is_new and age < HORIZON:
-            preview = Preview(age=age, cov=covs[age] if age else None)
+            preview = Preview(age=age, cov=cov if cov.any() else None)
             if adapts:
                 preview = Preview(
                     age=age,
@@ -199,11 +254,11 @@ def fly(
                     widening=loop.widening,
                     silence_widening=loop.silence_widening,
                 )
-            plan, begun = solver.solve(0, mean, target, preview), k
+            plan, begun = solver.solve(0, mean, solver.problem.target, preview), k
         if plan is not None and k - begun < HORIZON and age < HORIZON:
             inputs[k] = plan.inputs[k - begun]
         else:
-            inputs[k] = np.clip(-0.5 * mean[1::2], lower, upper)
+            inputs[k] = np.clip(-0.5 * mean[1 : plant.n_x : 2], lower, upper)
         off = x - target
         cost[k] = off @ problem.q_x @ off + inputs[k] @ problem.q_u @ inputs[k]
         x = plant.a @ x + plant.b @ inputs[k] + plant.e @ noise[k]
@@ -220,14 +275,21 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--design", type=float, default=0.3, help="share of independent losses of the design")
+    parser.add_argument("--late", type=int, default=0, help="steps that positions of the design are late")
+    parser.add_argument(
+        "--gust", type=float, default=0.0, help="share that a step keeps of a disturbance, by the design"
+    )
     parser.add_argument("--budgets", choices=("observed", "certificate", "configured"), default="observed")
     parser.add_argument("--before", type=int, default=0, help="steps before the flight whose ages count")
     parser.add_argument("--cells", default="", help="fly only cells with this in their names")
     given = parser.parse_args()
     adapts = given.budgets != "configured"
+    problem = make_problem(given.axes)
     solver = ConditionedSolver(
-        make_problem(given.axes),
-        bernoulli(np.array([1.0 - given.design])),
+        add_gusts(problem, given.gust) if given.gust else problem,
+        RunLengthAges(given.design, given.design, given.late)
+        if given.late
+        else bernoulli(np.array([1.0 - given.design])),
         ALLOWED,
         has_observed_levels=adapts,
         bounds_slack=not adapts,

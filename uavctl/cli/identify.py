@@ -25,7 +25,7 @@ from uavctl.config.load import dump_config, parse_recorded
 from uavctl.errors import DesignError, UsageError
 from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
 from uavctl.lab.identify.page import render_identify_page
-from uavctl.lab.identify.result import Identification, count_fits, describe_loss, identify
+from uavctl.lab.identify.result import Identification, count_fits, describe_gust, describe_loss, identify
 from uavctl.wiring.controller import build_flight_design
 
 
@@ -150,6 +150,7 @@ def _render(identification: Identification, target: Path, page: Path) -> Rendera
             ("delay", f"{delay_ms:.0f} ms, 99 % within {jitter_ms:.0f} ms more"),
         ],
     )
+    gusts = [f"gusts: {'; '.join(map(describe_gust, result.gusts))}"] if result.gusts else []
     warning_lines = [Text(text, style="yellow") for text in result.warnings]
     ramps = [ramp] if result.ramp_s > 0.0 else []
-    return Group(plant, kinds, *ramps, link, *warning_lines, f"configuration: {target}", f"page: {page}")
+    return Group(plant, kinds, *gusts, *ramps, link, *warning_lines, f"configuration: {target}", f"page: {page}")

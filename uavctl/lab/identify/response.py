@@ -2,10 +2,10 @@
 
 The two plants are continuous motions under white noise, with the parameters that a flight can show:
 
-    drag-lag              p' = v,  v' = a − c v + b + w,  T a' = g u(t − d) − a,  b' = n
+    drag-lag              p' = v,  v' = a − c v + b + h + w,  T a' = g u(t − d) − a,  b' = n,  h' = −h / T_h + m
     velocity-reference    `uavctl.smpc.plant`, with input u(t − d) + e
 
-w, e and n are white. The dead time d shifts the inputs and is no part of the motion.
+w, e, n and m are white; the gust h is there on request. The dead time d shifts the inputs and is no part of the motion.
 
 The motion is linear, so the filter steps from position to position; the effect of all inputs in between is summed
 beforehand. So are its gains, which depend on the times alone. All times are counted in units of half a millisecond, so
@@ -92,6 +92,8 @@ _WIND = FreeParameter("wind_mps2_rts", 1e-4, 10.0, True)
 _NOISE = FreeParameter("noise_m", 1e-3, 1.0, True)
 _INPUT = FreeParameter("input_mps2_rts", 1e-3, 10.0, True)
 _DRIFT = FreeParameter("drift_mps2_rts", 1e-3, 10.0, True)
+_GUST = FreeParameter("gust_mps2", 1e-3, 10.0, True)
+_GUST_TIME = FreeParameter("gust_s", 0.05, 10.0, True)  # a gust that lasts longer is a drift of the bias
 _MOTION_STD = (10.0, 2.0, 2.0)  # of position, velocity and acceleration
 
 
@@ -100,24 +102,31 @@ class DragLagAxis:
     """Plant of model drag-lag."""
 
     drifts: bool  # whether the bias is a random walk, as the estimator's is with `bias_drift`, and not a constant
+    has_gusts: bool = False
     name: ClassVar[str] = DRAG_LAG
-    start_std: ClassVar[tuple[float, ...]] = (*_MOTION_STD, 0.5)
+
+    @property
+    def start_std(self) -> tuple[float, ...]:
+        """Standard deviation of position, velocity, acceleration, bias, and gust, where a stretch begins."""
+        return (*_MOTION_STD, *((0.5, 0.5) if self.has_gusts else (0.5,)))
 
     @property
     def free(self) -> tuple[FreeParameter, ...]:
         """Lag, drag, gain and noises."""
-        return (_LAG, _DRAG, _GAIN, _WIND, _NOISE, *((_DRIFT,) if self.drifts else ()))
+        gusts = (_GUST, _GUST_TIME) if self.has_gusts else ()
+        return (_LAG, _DRAG, _GAIN, _WIND, _NOISE, *((_DRIFT,) if self.drifts else ()), *gusts)
 
     @property
     def starts(self) -> tuple[dict[str, float], ...]:
         """Two starts, with little and with much drag, as the likelihood has more than one maximum."""
         start_values = {"lag_s": 0.2, "gain": 1.0, "wind_mps2_rts": 0.05, "noise_m": 0.01, "drift_mps2_rts": 0.05}
+        start_values |= {"gust_mps2": 0.1, "gust_s": 0.5}
         return tuple({**start_values, "drag_1ps": drag} for drag in (0.1, 1.0))
 
     def motion(self, parameters: Array) -> LinearMotion:
-        """Return the motion of the states (p, v, a, b)."""
-        count, lag_s = len(parameters), np.exp(parameters[:, 0])
-        a, b, noise = np.zeros((count, 4, 4)), np.zeros((count, 4)), np.zeros((count, 4, 4))
+        """Return the motion of the states (p, v, a, b), and h behind them."""
+        count, lag_s, size = len(parameters), np.exp(parameters[:, 0]), len(self.start_std)
+        a, b, noise = np.zeros((count, size, size)), np.zeros((count, size)), np.zeros((count, size, size))
         a[:, 0, 1] = a[:, 1, 2] = a[:, 1, 3] = 1.0
         a[:, 1, 1] = -parameters[:, 1]
         a[:, 2, 2] = -1.0 / lag_s
@@ -125,6 +134,11 @@ class DragLagAxis:
         noise[:, 1, 1] = np.exp(2.0 * parameters[:, 3])
         if self.drifts:
             noise[:, 3, 3] = np.exp(2.0 * parameters[:, 5])
+        if self.has_gusts:
+            # Var h = s²:  m has the intensity 2 s² / T_h
+            rate_1ps = np.exp(-parameters[:, -1])
+            a[:, 1, 4], a[:, 4, 4] = 1.0, -rate_1ps
+            noise[:, 4, 4] = 2.0 * rate_1ps * np.exp(2.0 * parameters[:, -2])
         return LinearMotion(a, b, noise)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -27,6 +27,7 @@ from uavctl.lab.identify.fit import (
     is_worse,
     predict,
 )
+from uavctl.lab.identify.gusts import fit_gusts
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, Stretch, find_stretches, thin_positions
 from uavctl.lab.identify.response import (
     DRAG_LAG,
@@ -138,7 +139,9 @@ _DEFAULT_GAINS = {"XY": (1.0, 2.0, 1.0), "Z": (1.0, 5.0, 1.0)}  # position, velo
 _MODEL_KEYS = (
     *("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input"),
     *("gain", "position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2", "force_drift_mps2_rts"),
+    *("gust_mps2", "gust_s"),
 )
+_NO_GUST_S = 1.0  # time constant that is written for an axis without a gust
 
 
 class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
@@ -157,6 +160,15 @@ class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
     gain_std: float | None
     residual_std_m: float
     r2: float
+
+
+class Gust(msgspec.Struct, frozen=True, kw_only=True):
+    """Gust of one axis, as far as the flight shows its colour."""
+
+    axis: str
+    gust_mps2: float  # 0 where the flight shows no colour
+    gust_s: float | None  # None there
+    fall: float  # of the deviance by a gust; by chance it is above 18.5 in one of a thousand flights
 
 
 class Candidate(msgspec.Struct, frozen=True, kw_only=True):
@@ -186,6 +198,7 @@ class Identified(msgspec.Struct, frozen=True, kw_only=True):
     spreads: tuple[Spread, ...]  # of each axis and time ahead
     link: dict[str, object]
     warnings: tuple[str, ...]
+    gusts: tuple[Gust, ...] = ()  # of each axis, with plant `drag-lag`
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +212,13 @@ class Identification:
     # The flight as it was fitted to: positions thinned, setpoints ramped as the autopilot does
     flown: tuple[Stretch, ...]
     fits: tuple[AxisFit, ...]  # the chosen plant of each axis
+
+
+def describe_gust(gust: Gust) -> str:
+    """Describe the gust of an axis, or that the flight shows none."""
+    if gust.gust_s is None:
+        return f"{gust.axis} shows no colour"
+    return f"{gust.axis} {gust.gust_mps2:.2g} m/s² for {gust.gust_s:.2g} s"
 
 
 def count_fits(history: FlightHistory, config: Config) -> int:
@@ -223,7 +243,7 @@ def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None])
         _check_moved(flown, axis)
     models = get_candidate_models(history, config)
     candidates = [choose_dead_time(flown, axes, axis_models, on_fit) for axis_models in models]
-    chosen = candidates[0]
+    chosen, gusts = _add_gusts(config, flown, axes, candidates[0])
     predictions = [predict(flown, axis, fit) for axis, fit in zip(axes, chosen.fits, strict=True)]
     responses = tuple(
         _make_response(name, flown, fit, prediction, dt_s)
@@ -231,7 +251,7 @@ def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None])
     )
     link = fit_link(history.positions, history.losses)
     ramp_s = compute_ramp_delay_s(history, config)
-    identified_config = _make_config(config, chosen, ramp_s, responses, link)
+    identified_config = _make_config(config, chosen, ramp_s, responses, link, gusts)
     if history.latency_s is not None:
         identified_config = msgspec.structs.replace(
             identified_config,
@@ -256,8 +276,29 @@ def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None])
             *_describe_better_plants(chosen, candidates[1:]),
             *describe_wide_spreads(spreads, flown_s, drift_key),
         ),
+        gusts=gusts,
     )
     return Identification(result, identified_config, link, tuple(predictions), flown, chosen.fits)
+
+
+def _add_gusts(
+    config: Config, flown: Sequence[Stretch], axes: Sequence[int], chosen: ChosenPlant
+) -> tuple[ChosenPlant, tuple[Gust, ...]]:
+    """Return the plant with a gust in each axis where the flight shows one, and the gusts of all axes."""
+    if chosen.name != DRAG_LAG:
+        return chosen, ()
+    found = fit_gusts(flown, axes, chosen.fits, config.plant.dt_s)
+    fits = tuple(gust.fit if gust.is_shown else plain for gust, plain in zip(found, chosen.fits, strict=True))
+    gusts = tuple(
+        Gust(
+            axis=name,
+            gust_mps2=round(gust.fit.value("gust_mps2"), _DIGITS) if gust.is_shown else 0.0,
+            gust_s=round(gust.fit.value("gust_s"), _DIGITS) if gust.is_shown else None,
+            fall=gust.fall,
+        )
+        for name, gust in zip(config.plant.axes, found, strict=True)
+    )
+    return replace(chosen, fits=fits), gusts
 
 
 def make_fitted_stretches(history: FlightHistory, config: Config) -> tuple[Stretch, ...]:
@@ -394,7 +435,12 @@ def _describe_uncertain_axes(responses: Sequence[AxisResponse]) -> list[str]:
 
 
 def _make_config(
-    config: Config, chosen: ChosenPlant, ramp_s: float, responses: Sequence[AxisResponse], link: LinkFit
+    config: Config,
+    chosen: ChosenPlant,
+    ramp_s: float,
+    responses: Sequence[AxisResponse],
+    link: LinkFit,
+    gusts: Sequence[Gust],
 ) -> Config:
     """Return the configuration with the identified plant and link."""
     plant = msgspec.structs.replace(
@@ -404,7 +450,7 @@ def _make_config(
         drag_1ps=_round_values(response.drag_1ps for response in responses),
         lag_s=_round_values(response.lag_s for response in responses),
         wind_std_mps2=_round_values(response.wind_std_mps2 for response in responses),
-        **{**dict.fromkeys(_MODEL_KEYS, ()), **_get_model_values(chosen, responses)},
+        **{**dict.fromkeys(_MODEL_KEYS, ()), **_get_model_values(chosen, responses), **_get_gust_values(gusts)},
     )
     estimator = msgspec.structs.replace(
         config.estimator,
@@ -454,6 +500,16 @@ def _get_model_values(chosen: ChosenPlant, responses: Sequence[AxisResponse]) ->
         },
         "input_std_mps2": _round_values(response.input_std_mps2 or 0.0 for response in responses),
         "force_drift_mps2_rts": _round_values(response.force_drift_mps2_rts or 0.0 for response in responses),
+    }
+
+
+def _get_gust_values(gusts: Sequence[Gust]) -> dict[str, tuple[float, ...]]:
+    """Return the keys of `[plant]` for gusts; none where no axis shows one."""
+    if not any(gust.gust_mps2 for gust in gusts):
+        return {}
+    return {
+        "gust_mps2": tuple(gust.gust_mps2 for gust in gusts),
+        "gust_s": tuple(gust.gust_s or _NO_GUST_S for gust in gusts),
     }
 
 

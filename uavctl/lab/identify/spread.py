@@ -146,7 +146,10 @@ def get_configured_axis(config: Config, row: int) -> tuple[AxisModel, dict[str, 
     if plant.model == DRAG_LAG:
         gain = plant.gain[row] if plant.gain else 1.0
         values |= {"gain": gain, "drift_mps2_rts": estimator.bias_drift * gain}
-        configured: AxisModel = DragLagAxis(drifts=estimator.bias_drift > 0.0)
+        has_gusts = bool(plant.gust_mps2) and plant.gust_mps2[row] > 0.0
+        if has_gusts:
+            values |= {"gust_mps2": plant.gust_mps2[row], "gust_s": plant.gust_s[row]}
+        configured: AxisModel = DragLagAxis(drifts=estimator.bias_drift > 0.0, has_gusts=has_gusts)
     else:
         values |= {
             "input_mps2_rts": plant.input_std_mps2[row] * root_s,
