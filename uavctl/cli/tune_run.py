@@ -141,7 +141,8 @@ def _write_tuned(request: TuneRequest, recording: Path) -> tuple[Change, ...]:
         warn(f"{cut}: identified from the part before")
     history = read_recorded_history(read(recording))
     with show_fit_progress(count_fits(history, request.config)) as advance:
-        identification = identify(history, request.config, advance)
+        # Changes only raise wind and drift. A gust would take its share out of both, and is no change of its own.
+        identification = identify(history, request.config, advance, finds_gusts=False)
     write_atomically(
         request.folder / FIT_PAGE_FILE, render_identify_page(identification, history.positions, str(recording))
     )

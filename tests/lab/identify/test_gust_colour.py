@@ -43,15 +43,25 @@ def test_white_noise_shows_no_colour(seed: int) -> None:
     assert gust.fall > -0.1  # a gust of no strength is the plain plant
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("gust_mps2", "is_shown"), [(1.0, True), (0.0, False)])
-def test_the_keys_are_written_where_an_axis_shows_a_colour(gust_mps2: float, is_shown: bool) -> None:
+def make_history(gust_mps2: float) -> FlightHistory:
     flown = fly(4, 0.5, gust_mps2, axes=3)
-    history = FlightHistory(
+    return FlightHistory(
         SetpointHistory(flown.input_times_s, flown.inputs_mps2, np.ones(1200, dtype=np.bool_)),
         PositionHistory(flown.times_s, np.full(len(flown.times_s), 0.03), flown.positions_m),
         np.zeros(len(flown.times_s), dtype=np.int64),
     )
+
+
+@pytest.mark.slow
+def test_a_scheme_that_takes_no_gusts_gets_none() -> None:
+    result = identify(make_history(1.0), load_config("room-hahn-stursberg"), lambda: None)
+    assert (result.result.gusts, result.config.plant.gust_mps2) == ((), ())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("gust_mps2", "is_shown"), [(1.0, True), (0.0, False)])
+def test_the_keys_are_written_where_an_axis_shows_a_colour(gust_mps2: float, is_shown: bool) -> None:
+    history = make_history(gust_mps2)
     keys = ["lag_s=[0.12,0.12,0.12]", "drag_1ps=[0.3,0.3,0.3]", "gain=[1.1,1.1,1.1]", "dead_time_s=0"]
     result = identify(history, load_config("room-px4", [f"plant.{key}" for key in keys]), lambda: None)
     plant, gusts = result.config.plant, result.result.gusts

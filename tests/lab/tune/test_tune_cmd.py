@@ -53,8 +53,8 @@ def finished_run(
     """A whole run, its recordings in several files."""
     folder = tmp_path_factory.mktemp("tune") / "run"
 
-    def keep(history: FlightHistory, *given: Any) -> Identification:
-        identified.append((history, identify(history, *given)))
+    def keep(history: FlightHistory, *given: Any, **options: Any) -> Identification:
+        identified.append((history, identify(history, *given, **options)))
         return identified[-1][1]
 
     with short_flights(has_figures=True), pytest.MonkeyPatch.context() as patch:

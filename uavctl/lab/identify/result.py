@@ -226,12 +226,15 @@ def count_fits(history: FlightHistory, config: Config) -> int:
     return MAX_TRIES * len(get_candidate_models(history, config))
 
 
-def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None]) -> Identification:
+def identify(
+    history: FlightHistory, config: Config, on_fit: Callable[[], None], *, finds_gusts: bool = True
+) -> Identification:
     """Identify plant and link of a flight.
 
     Args:
         config: Configuration that the result goes into; its kind of plant, axes and Δt are kept.
         on_fit: Called after each fit, `count_fits` times.
+        finds_gusts: Whether a colour of the gusts is looked for, where the configuration's scheme takes gusts.
 
     Raises:
         RecordingError: The flight does not show enough.
@@ -243,7 +246,10 @@ def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None])
         _check_moved(flown, axis)
     models = get_candidate_models(history, config)
     candidates = [choose_dead_time(flown, axes, axis_models, on_fit) for axis_models in models]
-    chosen, gusts = _add_gusts(config, flown, axes, candidates[0])
+    chosen: ChosenPlant = candidates[0]
+    gusts: tuple[Gust, ...] = ()
+    if finds_gusts and chosen.name == DRAG_LAG and config.is_age_conditioned:
+        chosen, gusts = _add_gusts(config, flown, axes, chosen)
     predictions = [predict(flown, axis, fit) for axis, fit in zip(axes, chosen.fits, strict=True)]
     responses = tuple(
         _make_response(name, flown, fit, prediction, dt_s)
@@ -285,8 +291,6 @@ def _add_gusts(
     config: Config, flown: Sequence[Stretch], axes: Sequence[int], chosen: ChosenPlant
 ) -> tuple[ChosenPlant, tuple[Gust, ...]]:
     """Return the plant with a gust in each axis where the flight shows one, and the gusts of all axes."""
-    if chosen.name != DRAG_LAG:
-        return chosen, ()
     found = fit_gusts(flown, axes, chosen.fits, config.plant.dt_s)
     fits = tuple(gust.fit if gust.is_shown else plain for gust, plain in zip(found, chosen.fits, strict=True))
     gusts = tuple(
