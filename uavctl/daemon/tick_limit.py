@@ -16,11 +16,12 @@ from contextlib import contextmanager
 from types import FrameType
 
 from uavctl.errors import TickOverdueError
+from uavctl.flight.monitors.external import MAX_ANSWER_NS
 
 LIMIT_S = 1.0  # 20 ticks; vehicles leave the external mode after 0.5 to 3 s without a setpoint
-# With a controller of another package in control: a PX4 flies its last acceleration on for 0.7 s. In a room of 6 m the
-# vehicle then was 1.0 to 1.5 m outside.
-ENGAGED_LIMIT_S = 0.3
+# With a controller of another package in control: a later answer would end the plans anyway, and a PX4 flies its last
+# acceleration on for 0.7 s, which led out of a room of 6 m by 1.0 to 1.5 m.
+ENGAGED_LIMIT_S = MAX_ANSWER_NS * 1e-9
 _PERIOD_S = 0.05
 _SIGNAL = signal.SIGURG  # the only one that is ignored where nobody handles it, and that no timer sends
 
