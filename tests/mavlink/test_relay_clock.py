@@ -134,7 +134,7 @@ def test_a_flying_vehicle_keeps_its_position_and_its_room_whatever_the_round_tri
     assert_they_flow(rig, 8.0, off_s)
 
 
-@pytest.mark.parametrize("name", ["px4", "ardupilot"])
+@pytest.mark.parametrize("name", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 def test_a_relay_that_is_silent_is_reported_once_with_its_reason_and_its_end(name: str) -> None:
     rig = ready(name, both_ways(0.0, 0.0), "link.blackout=[[18.0, 20.5], [22.0, 22.4]]")
     rig.pilot_flies(EXTERNAL[name])
