@@ -130,9 +130,10 @@ def test_the_same_seeds_give_the_same_flights_of_vehicles_that_meet(plant: str) 
     assert first == run()
 
 
-@pytest.mark.parametrize("offset_m", [0.0, 0.1, 0.138, 0.142, 0.3])
+@pytest.mark.parametrize("offset_m", [0.0, 0.1, 0.1395, 0.1405, 0.3])
 def test_two_vehicles_at_4_mps_collide_exactly_if_their_paths_are_nearer_than_two_radii(offset_m: float) -> None:
-    first = make_config("sim.start_velocity_mps=[2.0,0,0]", plant="linear", start_m=(-0.503, 0.0, -1.0))
+    # At 0.1395 m they touch for 6 ms, between two computations.
+    first = make_config("sim.start_velocity_mps=[2.0,0,0]", plant="linear", start_m=(-0.523, 0.0, -1.0))
     second = make_config("sim.start_velocity_mps=[-2.0,0,0]", plant="linear", number=2, start_m=(0.5, offset_m, -1.0))
     drag = "plant.drag_1ps=[0.0,0.0,0.0]"
     configs = [load_with(first, drag), load_with(second, drag)]
@@ -141,10 +142,10 @@ def test_two_vehicles_at_4_mps_collide_exactly_if_their_paths_are_nearer_than_tw
     if offset_m > 2 * RADIUS_M:
         assert collisions == []
         assert closest.distance_m == pytest.approx(offset_m, abs=1e-9)
-        assert closest.at_ns == pytest.approx(1.003 / 4.0 * 1e9, abs=1e3)
+        assert closest.at_ns == pytest.approx(1.023 / 4.0 * 1e9, abs=1e3)
         return
     (collision,) = collisions
-    contact_s = (1.003 - math.sqrt((2 * RADIUS_M) ** 2 - offset_m**2)) / 4.0
+    contact_s = (1.023 - math.sqrt((2 * RADIUS_M) ** 2 - offset_m**2)) / 4.0
     assert collision.vehicles == (1, 2)
     assert collision.at_ns == pytest.approx(contact_s * 1e9, abs=1e3)
     assert collision.speed_mps == pytest.approx(4.0)
@@ -227,10 +228,18 @@ def test_a_vehicle_is_pushed_down_with_the_acceleration_of_the_closed_form(plant
     assert pushed_m == pytest.approx(0.5 * strength * 8.0 / 34.0 * GRAVITY_MPS2 * 0.1**2, rel=0.1)
 
 
-def test_the_upper_vehicle_and_those_on_the_floor_blow_nothing() -> None:
+def test_the_upper_vehicle_feels_nothing_and_only_turning_rotors_blow() -> None:
     assert hold([(0.0, 0.0, -1.6), (0.0, 0.0, -1.2)], 1.0).peers[0].vehicle.position_m == pytest.approx(
         hold([(0.0, 0.0, -1.6)], 1.0).peers[0].vehicle.position_m, abs=0.0
     )
+    space = hold([(0.0, 0.0, -1.6), (0.0, 0.0, -1.2)], 1.0)
+    upper, lower = (peers.vehicle for peers in space.peers)
+    before_mps2 = lower.acceleration_mps2[2]
+    share = compute_downwash_share(upper.position_m, lower.position_m, RADIUS_M)
+    assert share > 0.05
+    upper.wreck()
+    space.advance(SECOND_NS + PERIOD_NS)
+    assert before_mps2 - lower.acceleration_mps2[2] == pytest.approx(share * GRAVITY_MPS2, abs=0.1)
     vehicle = hold([(0.0, 0.0, -1.6)], 0.1).peers[0].vehicle
     assert vehicle.has_downwash
     vehicle.stand_on_floor()
