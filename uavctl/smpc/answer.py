@@ -59,6 +59,10 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
     widening: float = 1.0  # factor of all standard deviations of the rows
     silence_widening: float = 1.0  # further factor of those of information H steps old
 
+    # Right sides of the state rows (m_x,) where the plan rests, for a cell those of its last box; None: the tightest
+    # ones of all stages
+    resting_limits: Array | None = None
+
     @property
     def nominal(self) -> bool:
         """Whether the preview adds nothing to the design."""
@@ -71,7 +75,7 @@ NOMINAL = Preview()
 def is_finite(x: Array, target: Array, preview: Preview) -> bool:
     """Return whether all numbers of a question are finite."""
     arrays = [x, target]
-    for values in (preview.cov, preview.limits, preview.sent, *(preview.input_bounds or ())):
+    for values in (preview.cov, preview.limits, preview.resting_limits, preview.sent, *(preview.input_bounds or ())):
         if values is not None:
             arrays.append(values)
     if preview.path is not None:

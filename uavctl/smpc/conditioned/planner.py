@@ -318,7 +318,7 @@ class ConditionedSolver:
 
     def _find_rest(self, target: Array, preview: Preview) -> _Rest:
         """Find where a plan rests; that of the last target is kept, by its bits, without limits or a path."""
-        if preview.limits is not None or preview.path is not None:
+        if preview.limits is not None or preview.path is not None or preview.resting_limits is not None:
             return self._make_rest(target, preview)
         key = preview.level, preview.widening, target.tobytes()
         if self._cached_rest is None or self._cached_rest[0] != key:
@@ -348,7 +348,7 @@ class ConditionedSolver:
         """
         if not self._levels.get(preview.level).near.follows_age or preview.path is not None:
             return ()
-        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        sides = self._select_resting_sides(limits, preview)
         count = self._count_limits(target, sides, preview)
         if not count:
             return ()
@@ -396,6 +396,12 @@ class ConditionedSolver:
             limits = preview.limits[1:] if self._in_order else preview.limits[1:, self._rows]
         return limits
 
+    def _select_resting_sides(self, limits: Array, preview: Preview) -> Array:
+        """Return the right sides of the state rows (m,) where the plan rests, of limits in each stage or of all."""
+        if preview.resting_limits is not None:
+            return preview.resting_limits if self._in_order else preview.resting_limits[self._rows]
+        return limits if limits.ndim == 1 else limits.min(axis=0)
+
     def _select_allocation(self, target_rows: Array, limits: Array, preview: Preview) -> Allocation:
         """Select the allocation of a plan, by data that do not depend on the age: all ages must share one.
 
@@ -436,7 +442,7 @@ class ConditionedSolver:
 
     def _find_reference(self, target: Array, limits: Array, preview: Preview) -> Array:
         """Return the equilibrium (n_x,) nearest to the target at rest; the rows that limit it share the budgets."""
-        sides = limits if limits.ndim == 1 else limits.min(axis=0)
+        sides = self._select_resting_sides(limits, preview)
         reference, count = np.array(target), self._count_limits(target, sides, preview)
         if not count:
             return reference

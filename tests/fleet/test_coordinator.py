@@ -1,0 +1,151 @@
+"""Cells under arbitrary loss, delay, order and repetition of messages: those in use are always apart."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from uavctl.fleet.boxes import Boxes, find_gaps
+from uavctl.fleet.cell import Cell, CellChoice, Conduct, Plan, Report, decide_cell
+from uavctl.fleet.coordinator import CellParameters, advance, begin, issue, receive
+
+STAGES = 8
+PARAMETERS = CellParameters(
+    distance_m=0.5,
+    room_lower_m=np.array([-3.0, -3.0, -3.0]),
+    room_upper_m=np.array([3.0, 3.0, 0.0]),
+    accel_mps2=np.array([2.0, 2.0, 1.5]),
+    speed_mps=np.array([1.5, 1.5, 1.0]),
+    dt_s=0.1,
+    stages=STAGES,
+    silence_s=1e9,
+)
+STARTS_M = np.array([[-2.0, 0.1, -1.2], [2.0, 0.0, -1.2], [0.0, 2.0, -1.2], [0.1, -2.0, -2.0], [0.0, 0.2, -1.0]])
+GOALS_M = STARTS_M[[1, 0, 3, 2, 4]]
+
+
+def gather(cells: list[Cell], step: int) -> Boxes:
+    index = [np.clip(np.arange(STAGES) + step - cell.step, 0, STAGES - 1) for cell in cells]
+    pairs = list(zip(cells, index, strict=True))
+    return Boxes(np.array([c.lower_m[i] for c, i in pairs]), np.array([c.upper_m[i] for c, i in pairs]))
+
+
+def draw_plan(rng: np.random.Generator, cell: Cell, step: int) -> Plan:
+    """Draw a plan inside of a cell, with small margins, towards the goal of the cell or anywhere."""
+    lower_m, upper_m = cell.find_limits(step, STAGES - 1)
+    place_m = cell.goal_m if rng.random() < 0.7 else rng.uniform(-3.0, 3.0, 3)
+    half_m = 0.5 * (upper_m - lower_m)
+    margin_m = np.minimum(0.02, half_m)
+    mean_m = np.clip(place_m, lower_m + margin_m, upper_m - margin_m)
+    return Plan(step, np.vstack([mean_m[:1], mean_m]), np.vstack([np.zeros((1, 3)), margin_m]))
+
+
+@pytest.mark.parametrize(("loss", "delay"), [(0.0, 0), (0.3, 2), (0.8, 1), (0.3, 12)])
+@pytest.mark.parametrize("seed", range(3))
+def test_cells_in_use_are_apart_for_any_fate_of_messages(loss: float, delay: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
+    choices = [CellChoice(cell, cell.number) for cell in state.newest]
+    inboxes: list[list[tuple[int, Cell]]] = [[] for _ in choices]
+    sent_reports: list[tuple[int, int, Report]] = []
+    taken = refused = 0
+    for step in range(150):
+        state = advance(state, step)
+        for at, i, report in sent_reports:
+            if at == step:
+                state = receive(state, {i: report})
+        state = issue(state, PARAMETERS)
+        for i, cell in enumerate(state.newest):
+            for _ in range(2):  # each message twice
+                if rng.random() >= loss:
+                    inboxes[i].append((step + int(rng.integers(delay + 1)), cell))
+        for i, choice in enumerate(choices):
+            due = [cell for at, cell in inboxes[i] if at == step]
+            plan = draw_plan(rng, choice.cell, step) if rng.random() < 0.5 else state.reports[i].plan
+            for cell in due:
+                before, choice = choice, decide_cell(choice, cell, step, plan)
+                taken += choice.cell is not before.cell
+                refused += choice.decided != before.decided and choice.cell is before.cell
+            choices[i] = choice
+            if rng.random() >= loss:
+                report = Report(draw_plan(rng, choice.cell, step), np.zeros(3), choice.cell.number, choice.decided)
+                sent_reports.append((step + 1 + int(rng.integers(delay + 1)), i, report))
+        used = gather([choice.cell for choice in choices], step)
+        gaps = find_gaps(used, used, PARAMETERS.distance_m)[np.triu_indices(len(choices), 1)]
+        assert gaps.min() >= 1.0 - 1e-9
+        # The cell in use is inside of the claim: for these stages and for good
+        claims = state.claims
+        assert (used.lower_m >= claims.lower_m - 1e-12).all()
+        assert (used.upper_m <= claims.upper_m + 1e-12).all()
+    assert taken > 20
+    assert refused > 0
+
+
+def test_a_plan_in_progress_is_inside_of_the_new_cell() -> None:
+    rng = np.random.default_rng(5)
+    state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
+    choices = [CellChoice(cell, cell.number) for cell in state.newest]
+    for step in range(60):
+        plans = [draw_plan(rng, choice.cell, step) for choice in choices]
+        reports = [
+            Report(plan, np.zeros(3), choice.cell.number, choice.decided)
+            for plan, choice in zip(plans, choices, strict=True)
+        ]
+        state = issue(receive(advance(state, step), dict(enumerate(reports))), PARAMETERS)
+        for i, (plan, cell) in enumerate(zip(plans, state.newest, strict=True)):
+            assert cell.number == choices[i].cell.number + 1
+            for later in (step, step + 1, step + 5):
+                assert cell.compute_excess_m(later, plan).max() <= 1e-9
+            choices[i] = decide_cell(choices[i], cell, step, plan)
+            assert choices[i].cell is cell
+
+
+def test_a_cell_that_cuts_the_plan_is_refused_and_the_refusal_frees_the_claim() -> None:
+    state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
+    state = issue(state, PARAMETERS)
+    cell, choice = state.newest[0], CellChoice(begin(0, STARTS_M, GOALS_M, PARAMETERS).newest[0], 0)
+    cut = dataclasses.replace(cell, lower_m=cell.upper_m - 0.01)
+    after = decide_cell(choice, cut, 0, state.reports[0].plan)
+    assert after.cell is choice.cell
+    assert after.decided == cut.number
+    assert decide_cell(after, cell, 0, state.reports[0].plan) is after  # decided once
+    report = Report(state.reports[0].plan.advance(1), np.zeros(3), 0, cut.number)
+    state = receive(advance(state, 1), {0: report})
+    np.testing.assert_array_equal(state.claims.lower_m[0], state.used.lower_m[0])
+
+
+def test_an_older_report_changes_nothing() -> None:
+    state = issue(begin(0, STARTS_M, GOALS_M, PARAMETERS), PARAMETERS)
+    plan = state.reports[0].plan
+    state = receive(advance(state, 3), {0: Report(plan.advance(3), np.zeros(3), 1, 1)})
+    late = receive(state, {0: Report(plan.advance(2), np.zeros(3), 0, 0)})
+    assert late.used_numbers == state.used_numbers
+    assert late.reports == state.reports
+
+
+def test_vehicles_too_near_at_the_beginning_are_refused() -> None:
+    with pytest.raises(ValueError, match="vehicles 0 and 1"):
+        begin(0, STARTS_M[[0, 0]] + np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]), GOALS_M[:2], PARAMETERS)
+
+
+def test_cells_keep_away_from_a_released_vehicle_or_their_vehicle_is_told_to_land() -> None:
+    state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
+    plan, velocity_mps = state.reports[4].plan, np.array([1.0, 0.0, 0.0])
+    state = receive(state, {4: Report(plan, velocity_mps, 0, 0, Conduct.FREE)})
+    state = issue(state, PARAMETERS)
+    rng, times_s = np.random.default_rng(0), 0.1 * np.arange(STAGES)
+    kept = [cell for cell in state.newest[:4] if not cell.land]
+    assert kept
+    for _ in range(200):
+        # Any motion within the limits: one acceleration each step
+        accel = PARAMETERS.accel_mps2 * rng.choice([-1.0, 0.0, 1.0], (STAGES, 3))
+        position_m, velocity = STARTS_M[4].copy(), velocity_mps.copy()
+        for s in range(len(times_s)):
+            for cell in kept:
+                offset_m = np.maximum(cell.lower_m[s] - position_m, position_m - cell.upper_m[s])
+                assert (offset_m / np.array([0.5, 0.5, 1.5])).max() >= 1.0
+            after = np.clip(velocity + 0.1 * accel[s], -PARAMETERS.speed_mps, PARAMETERS.speed_mps)
+            position_m, velocity = position_m + 0.05 * (velocity + after), after
+    # Seen again after two seconds of silence, it may be anywhere: all others land
+    state = issue(advance(state, 20), PARAMETERS)
+    assert all(cell.land for cell in state.newest[:4])

@@ -1,0 +1,90 @@
+"""Right of way on grids, exhaustively: two vehicles always arrive."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from uavctl.fleet.right_of_way import LOOK_AHEAD_M, PASS_M, Move, Ways, choose_guides, choose_move
+
+Node = tuple[int, int]
+TURNS: tuple[Node, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # north, east, south, west: quarter turns to the right
+
+
+def list_ways(place: Node, goal: Node, heading: int | None) -> list[int]:
+    """List the directions that lead to the goal, that of the longer way first."""
+    north, east = goal[0] - place[0], goal[1] - place[1]
+    ways = [(abs(north), 0 if north > 0 else 2)] * bool(north) + [(abs(east), 1 if east > 0 else 3)] * bool(east)
+    return [way for _, way in sorted(ways, key=lambda entry: (-entry[0], entry[1] != heading))]
+
+
+def count_rounds(shape: Node, starts: tuple[Node, ...], goals: tuple[Node, ...]) -> int | None:
+    """Count the rounds until all have arrived; None if a situation comes again before."""
+    places, seen = list(starts), set()
+    headings: list[int | None] = [None] * len(starts)
+    for rounds in itertools.count():
+        if tuple(places) == goals:
+            return rounds
+        situation = tuple(places), tuple(headings)
+        if situation in seen:
+            return None
+        seen.add(situation)
+        for i in range(len(goals)):
+            move_one(shape, places, headings, i, goals)
+    return None
+
+
+def move_one(shape: Node, places: list[Node], headings: list[int | None], i: int, goals: tuple[Node, ...]) -> None:
+    def find(way: int) -> Node:
+        return places[i][0] + TURNS[way % 4][0], places[i][1] + TURNS[way % 4][1]
+
+    def is_free(way: int) -> bool:
+        node = find(way)
+        return 0 <= node[0] < shape[0] and 0 <= node[1] < shape[1] and node not in places
+
+    ways = list_ways(places[i], goals[i], headings[i])
+    if not ways:
+        headings[i] = None
+        return
+    way = next((way for way in ways if is_free(way)), ways[0])
+    blocker = places.index(find(way)) if find(way) in places else i
+    free: dict[Move, bool] = {move: is_free(way + move.value) for move in Move if move is not Move.WAIT}
+    move = choose_move(free, has_right_of_way=i < blocker and places[blocker] != goals[blocker])
+    if move is not Move.WAIT:
+        way = (way + move.value) % 4
+        headings[i], places[i] = way, find(way)
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 3), (3, 2), (2, 5), (3, 3)])
+def test_two_vehicles_always_arrive(shape: Node) -> None:
+    nodes = list(itertools.product(range(shape[0]), range(shape[1])))
+    pairs = list(itertools.permutations(nodes, 2))
+    longest = 2 * sum(shape)
+    for starts in pairs:
+        for goals in pairs:
+            rounds = count_rounds(shape, starts, goals)
+            assert rounds is not None, (starts, goals)
+            assert rounds <= longest, (starts, goals)
+
+
+WAYS = Ways(0.5, 0.06, np.array([-3.0, -3.0, -3.0]), np.array([3.0, 3.0, 0.0]))
+
+
+def test_two_face_to_face_both_pass_on_the_right() -> None:
+    positions_m = np.array([[-0.6, 0.0, -1.0], [0.6, 0.0, -1.0]])
+    guides_m = choose_guides(positions_m, np.array([[2.0, 0.0, -1.0], [-2.0, 0.0, -1.0]]), WAYS)
+    np.testing.assert_allclose(guides_m, [[-0.6, PASS_M, -1.0], [0.6, -PASS_M, -1.0]], atol=1e-12)
+
+
+def test_a_free_way_leads_to_the_goal() -> None:
+    positions_m = np.array([[0.0, 0.0, -1.0], [-0.6, 0.0, -1.0], [LOOK_AHEAD_M + 0.1, 0.0, -1.0], [0.6, 0.0, -2.6]])
+    goals_m = np.array([[2.9, 0.0, -1.0], [-0.6, 0.0, -1.0], [2.0, 0.0, -1.0], [0.6, 0.0, -2.6]])
+    np.testing.assert_array_equal(choose_guides(positions_m, goals_m, WAYS)[0], goals_m[0])
+
+
+def test_a_vehicle_at_its_goal_gives_way_to_one_that_cannot_pass() -> None:
+    # In the corner behind it, with walls to the right, to the left and behind
+    walls = Ways(0.5, 0.06, np.array([-3.0, -0.5, -3.0]), np.array([3.0, 0.5, 0.0]))
+    positions_m = np.array([[-2.5, 0.0, -1.0], [-1.5, 0.0, -1.0]])
+    guides_m = choose_guides(positions_m, np.array([[2.0, 0.0, -1.0], [-1.5, 0.0, -1.0]]), walls)
+    np.testing.assert_allclose(guides_m, [[-2.5, 0.0, -1.0], [-1.5 + PASS_M, 0.0, -1.0]], atol=1e-12)

@@ -1,0 +1,233 @@
+"""Coordinator of the cells: pure transitions of its state by reports and cycles.
+
+A cycle issues at most one new cell to each vehicle, and sends the newest one again until the vehicle has decided about
+it. Cells and reports may be lost, late, repeated or out of order.
+
+1. The claim of a vehicle is the hull of the cell that it reported in use and of all cells issued since. So the cell in
+   use is always inside of the claim.
+2. Planes divide the claims of each pair in each stage, `boxes.divide_pairs`. They limit the new cells of both.
+3. A new cell is the plan in progress with its margins, extended towards the goal as far as the vehicle can fly, and
+   cut by the planes. Planes are outside of the claim, so they never cut the plan.
+4. Claims of all vehicles stay apart: a new cell is apart from the new cells and from the claims of all others.
+5. A vehicle that keeps to no cell is an obstacle that grows. Cells avoid it. A vehicle whose plan may meet it is told
+   to land.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uavctl.arrays import Array, Flags
+from uavctl.fleet.boxes import Bounds, Boxes, divide_pairs, find_gaps, get_axis_distances_m
+from uavctl.fleet.cell import Cell, Conduct, Plan, Report
+from uavctl.fleet.obstacles import find_reach
+from uavctl.fleet.right_of_way import Ways, choose_guides
+
+START_NUMBER = 0  # number of the cell in which a vehicle begins
+NO_CELL = -1  # number before any cell
+
+
+@dataclass(frozen=True, eq=False)
+class CellParameters:
+    """Constants of the cells."""
+
+    distance_m: float  # horizontal distance that all pairs keep
+    room_lower_m: Array  # (3,), local NED
+    room_upper_m: Array  # (3,)
+    accel_mps2: Array  # largest acceleration of each axis (3,)
+    speed_mps: Array  # largest speed of each axis (3,)
+    dt_s: float  # a step
+    stages: int  # S, boxes of a cell: one more than the steps of a plan
+    # Room around a plan for its changes while a cell is on its way. With less, vehicles refuse more cells; with more,
+    # two vehicles pass at a larger distance
+    margin_m: float = 0.06
+    reach_m: float = 1.2  # longest extension beyond the plan: about the way of a plan between two cells
+    silence_s: float = 1.0  # time without a report after which a vehicle counts as an obstacle
+
+
+@dataclass(frozen=True, eq=False)
+class CoordinatorState:
+    """State of the coordinator; boxes begin at `step`."""
+
+    step: int
+    used: Boxes  # cells reported in use
+    used_numbers: tuple[int, ...]
+    pending: Boxes  # hull of all cells issued since
+    newest: tuple[Cell, ...]  # newest cell of each vehicle
+    reports: tuple[Report, ...]  # newest report of each vehicle
+    goals_m: Array  # place that each vehicle is to reach (N, 3)
+
+    @property
+    def claims(self) -> Boxes:
+        """Hull of all cells that each vehicle may use."""
+        return self.used.cover(self.pending)
+
+    @property
+    def is_decided(self) -> Flags:
+        """Whether a vehicle has decided about its newest cell (N,)."""
+        return np.array(
+            [report.decided >= cell.number for report, cell in zip(self.reports, self.newest, strict=True)], dtype=bool
+        )
+
+
+def begin(step: int, positions_m: Array, goals_m: Array, parameters: CellParameters) -> CoordinatorState:
+    """Begin with vehicles at rest, each in a cell around its position; both sides know these cells.
+
+    Raises:
+        ValueError: Two of these cells are nearer than the distance.
+    """
+    stages, half_m = parameters.stages, parameters.margin_m
+    shape = (len(positions_m), stages, 3)
+    lower_m = np.broadcast_to((positions_m - half_m)[:, None], shape)
+    upper_m = np.broadcast_to((positions_m + half_m)[:, None], shape)
+    used = Boxes(lower_m, upper_m)
+    gaps = find_gaps(used, used, parameters.distance_m)[:, :, 0] + 2.0 * np.eye(len(positions_m))
+    if gaps.min(initial=1.0) < 1.0:
+        first, second = np.unravel_index(int(gaps.argmin()), gaps.shape)
+        raise ValueError(
+            f"vehicles {first} and {second} begin too near to each other for cells {parameters.distance_m:g} m apart:"
+            f" place them {parameters.distance_m + 2.0 * half_m:g} m apart, north or east"
+        )
+    rest = [Plan(step, np.tile(place, (stages, 1)), np.zeros((stages, 3))) for place in positions_m]
+    return CoordinatorState(
+        step=step,
+        used=used,
+        used_numbers=(START_NUMBER,) * len(positions_m),
+        pending=Boxes.make_empty(len(positions_m), stages),
+        newest=tuple(Cell(START_NUMBER, step, lower_m[i], upper_m[i], place) for i, place in enumerate(positions_m)),
+        reports=tuple(Report(plan, np.zeros(3), START_NUMBER, START_NUMBER) for plan in rest),
+        goals_m=goals_m,
+    )
+
+
+def advance(state: CoordinatorState, step: int) -> CoordinatorState:
+    """Advance the boxes to a later step."""
+    steps = step - state.step
+    return replace(state, step=step, used=state.used.advance(steps), pending=state.pending.advance(steps))
+
+
+def receive(state: CoordinatorState, reports: Mapping[int, Report]) -> CoordinatorState:
+    """Take up reports by the number of the vehicle; older ones than the newest known change nothing."""
+    newest, numbers = list(state.reports), list(state.used_numbers)
+    is_taken, is_refused = np.zeros(len(newest), dtype=bool), np.zeros(len(newest), dtype=bool)
+    for i, report in reports.items():
+        if report.order < newest[i].order:
+            continue
+        newest[i], number = report, state.newest[i].number
+        is_taken[i] = report.in_use == number != numbers[i]
+        is_refused[i] = report.decided >= number and report.in_use == numbers[i]
+        if is_taken[i]:
+            numbers[i] = number
+    cells = _gather_boxes(state.newest, state.step)
+    pending = Boxes.make_empty(*state.used.lower_m.shape[:2]).take(is_taken | is_refused, state.pending)
+    used = cells.take(is_taken, state.used)
+    return replace(state, used=used, pending=pending, used_numbers=tuple(numbers), reports=tuple(newest))
+
+
+def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorState:
+    """Issue new cells where the newest ones are decided; `state.newest` is what to send."""
+    step = state.step
+    is_free = np.array(
+        [
+            report.conduct is Conduct.FREE or (step - report.plan.step) * parameters.dt_s > parameters.silence_s
+            for report in state.reports
+        ],
+        dtype=bool,
+    )
+    positions_m, plans = _gather_plans(state, parameters)
+    claims = Boxes.make_empty(*plans.lower_m.shape[:2]).take(is_free, state.claims)
+    bounds = divide_pairs(claims, plans, parameters.distance_m)
+    away, must_land = _avoid_obstacles(state, is_free, plans, parameters)
+    guides_m = choose_guides(
+        positions_m,
+        state.goals_m,
+        Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m),
+    )
+    floor_m = plans.upper_m[:, -1].copy()
+    floor_m[:, 2] = parameters.room_upper_m[2]
+    guides_m = np.where(must_land[:, None], floor_m, guides_m)
+    wanted = _extend(plans, guides_m, parameters)
+    lower_m = np.maximum(wanted.lower_m, bounds.lower_m)
+    upper_m = np.minimum(wanted.upper_m, bounds.upper_m)
+    avoids = ~must_land[:, None, None]
+    lower_m = np.where(avoids, np.maximum(lower_m, away.lower_m), lower_m)
+    upper_m = np.where(avoids, np.minimum(upper_m, away.upper_m), upper_m)
+    is_threatened = np.isfinite(away.lower_m).any(axis=(1, 2)) | np.isfinite(away.upper_m).any(axis=(1, 2))
+    is_new = ~is_free & bounds.is_divided & (state.is_decided | is_threatened | must_land)
+    cells = Boxes(lower_m, upper_m)
+    is_new &= ~cells.is_empty
+    newest = tuple(
+        Cell(cell.number + 1, step, lower_m[i], upper_m[i], guides_m[i], bool(must_land[i])) if is_new[i] else cell
+        for i, cell in enumerate(state.newest)
+    )
+    return replace(state, pending=state.pending.cover(cells).take(is_new, state.pending), newest=newest)
+
+
+def _gather_boxes(cells: Sequence[Cell], step: int) -> Boxes:
+    """Gather the boxes of cells from a step on."""
+    stages = np.arange(len(cells[0].lower_m))
+    index = [np.minimum(stages + step - cell.step, len(stages) - 1) for cell in cells]
+    return Boxes(
+        np.array([cell.lower_m[i] for cell, i in zip(cells, index, strict=True)]),
+        np.array([cell.upper_m[i] for cell, i in zip(cells, index, strict=True)]),
+    )
+
+
+def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[Array, Boxes]:
+    """Gather the positions (N, 3), and the boxes of the plans in progress with margins, inside of the cells in use.
+
+    Box s contains the mean of stages s and s + 1.
+    """
+    plans = [report.plan.advance(state.step) for report in state.reports]
+    mean_m, margin_m = np.array([plan.mean_m for plan in plans]), np.array([plan.margin_m for plan in plans])
+    lower_m, upper_m = mean_m - margin_m - parameters.margin_m, mean_m + margin_m + parameters.margin_m
+    later = np.minimum(np.arange(parameters.stages) + 1, parameters.stages - 1)
+    boxes = Boxes(np.minimum(lower_m, lower_m[:, later]), np.maximum(upper_m, upper_m[:, later]))
+    return mean_m[:, 0], boxes.clip_to(state.used)
+
+
+def _extend(plans: Boxes, guides_m: Array, parameters: CellParameters) -> Boxes:
+    """Extend boxes towards places (N, 3), as far as a vehicle can depart from its plan, inside of the room."""
+    # s(t) = min(a t² / 2, v t, reach)
+    times_s = parameters.dt_s * np.arange(1, parameters.stages + 1)[:, None]
+    way_m = np.minimum(0.5 * parameters.accel_mps2 * times_s**2, parameters.speed_mps * times_s)
+    way_m = np.minimum(way_m, parameters.reach_m)
+    places_m = guides_m[:, None]
+    lower_m = np.minimum(plans.lower_m, np.maximum(plans.lower_m - way_m, places_m - parameters.margin_m))
+    upper_m = np.maximum(plans.upper_m, np.minimum(plans.upper_m + way_m, places_m + parameters.margin_m))
+    return Boxes(
+        np.minimum(plans.lower_m, np.maximum(lower_m, parameters.room_lower_m)),
+        np.maximum(plans.upper_m, np.minimum(upper_m, parameters.room_upper_m)),
+    )
+
+
+def _avoid_obstacles(
+    state: CoordinatorState, is_free: Flags, plans: Boxes, parameters: CellParameters
+) -> tuple[Bounds, Flags]:
+    """Return the sides of the planes beside obstacles, and whether a vehicle's plan may meet one (N,)."""
+    needed = get_axis_distances_m(parameters.distance_m)
+    lower_m, upper_m = np.full(plans.lower_m.shape, -np.inf), np.full(plans.upper_m.shape, np.inf)
+    must_land = np.zeros(len(is_free), dtype=bool)
+    for i in np.flatnonzero(is_free):
+        report = state.reports[i]
+        times_s = np.arange(parameters.stages + 1, dtype=np.float64)
+        times_s = parameters.dt_s * (times_s + (state.step - report.plan.step))
+        reach_lower_m, reach_upper_m = find_reach(
+            report.plan.mean_m[0], report.velocity_mps, parameters.accel_mps2, parameters.speed_mps, times_s
+        )
+        # Box s: from stage s to s + 1
+        low_m = np.minimum(reach_lower_m[:-1], reach_lower_m[1:]) - parameters.margin_m - needed
+        high_m = np.maximum(reach_upper_m[:-1], reach_upper_m[1:]) + parameters.margin_m + needed
+        gap = np.concatenate([low_m - plans.upper_m, plans.lower_m - high_m], axis=2) / np.tile(needed, 2)
+        choice = gap.argmax(axis=2)
+        must_land |= (gap.max(axis=2) < 0.0).any(axis=1)
+        vehicle, stage = np.nonzero(np.ones(choice.shape, dtype=bool))
+        axis, is_below = choice.ravel() % 3, choice.ravel() < 3
+        at = vehicle, stage, axis
+        np.minimum.at(upper_m, at, np.where(is_below, low_m[stage, axis], np.inf))
+        np.maximum.at(lower_m, at, np.where(is_below, -np.inf, high_m[stage, axis]))
+    must_land &= ~is_free
+    return Bounds(lower_m, upper_m, ~must_land), must_land
