@@ -8,6 +8,7 @@ import pytest
 from uavctl.fleet.boxes import Boxes, find_gaps
 from uavctl.fleet.cell import Cell, CellChoice, Conduct, Plan, Report, decide_cell
 from uavctl.fleet.coordinator import CellParameters, advance, begin, issue, receive
+from uavctl.fleet.voronoi import make_voronoi_cells
 
 STAGES = 8
 PARAMETERS = CellParameters(
@@ -149,3 +150,11 @@ def test_cells_keep_away_from_a_released_vehicle_or_their_vehicle_is_told_to_lan
     # Seen again after two seconds of silence, it may be anywhere: all others land
     state = issue(advance(state, 20), PARAMETERS)
     assert all(cell.land for cell in state.newest[:4])
+
+
+def test_buffered_voronoi_cells_contain_their_vehicles_and_are_apart() -> None:
+    cells = make_voronoi_cells(STARTS_M[:4], GOALS_M[:4], 1, 0, PARAMETERS)
+    boxes = Boxes(np.array([cell.lower_m for cell in cells]), np.array([cell.upper_m for cell in cells]))
+    assert (boxes.lower_m[:, 0] <= STARTS_M[:4]).all()
+    assert (boxes.upper_m[:, 0] >= STARTS_M[:4]).all()
+    assert find_gaps(boxes, boxes, PARAMETERS.distance_m)[np.triu_indices(4, 1)].min() >= 1.0 - 1e-9

@@ -55,7 +55,7 @@ def move_one(shape: Node, places: list[Node], headings: list[int | None], i: int
         headings[i], places[i] = way, find(way)
 
 
-@pytest.mark.parametrize("shape", [(2, 2), (2, 3), (3, 2), (2, 5), (3, 3)])
+@pytest.mark.parametrize("shape", [(2, 2), (2, 3), (3, 2), (2, 5), (3, 3), (3, 4), (4, 4)])
 def test_two_vehicles_always_arrive(shape: Node) -> None:
     nodes = list(itertools.product(range(shape[0]), range(shape[1])))
     pairs = list(itertools.permutations(nodes, 2))

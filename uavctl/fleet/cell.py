@@ -2,8 +2,8 @@
 
 1. A vehicle uses one cell at a time. It decides about a cell once, in the order of their numbers: a number that is not
    above the last one decided is ignored.
-2. It takes a new cell only if its plan in progress keeps it as well as the old one. So the next program has the plan
-   in progress as a solution.
+2. It takes a new cell only if its plan in progress keeps it as well as the old one, or a new plan does. So the next
+   program has that plan as a solution.
 3. It reports the number in use and the last number decided. Without a new cell it stays in the one in use for good.
 """
 
@@ -93,7 +93,7 @@ class CellChoice:
 
 
 def decide_cell(choice: CellChoice, new: Cell, step: int, plan: Plan) -> CellChoice:
-    """Take or refuse a new cell at a step, by the plan in progress."""
+    """Take or refuse a new cell at a step, by the plan in progress or by a new one."""
     if new.number <= choice.decided:
         return choice
     allowed_m = choice.cell.compute_excess_m(step, plan) + KEPT_TOLERANCE_M

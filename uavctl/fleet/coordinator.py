@@ -27,7 +27,8 @@ from uavctl.fleet.obstacles import find_reach
 from uavctl.fleet.right_of_way import Ways, choose_guides
 
 START_NUMBER = 0  # number of the cell in which a vehicle begins
-NO_CELL = -1  # number before any cell
+LANDING_WAY_M = 1.2  # way to the side on which a vehicle lands beside an obstacle's way
+MIN_SPEED_MPS, MIN_WAY_M = 0.1, 0.01  # an obstacle that is slower stands; a vehicle that is nearer has no side
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +147,16 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
         state.goals_m,
         Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m),
     )
-    floor_m = plans.upper_m[:, -1].copy()
-    floor_m[:, 2] = parameters.room_upper_m[2]
-    guides_m = np.where(must_land[:, None], floor_m, guides_m)
+    guides_m = np.where(must_land[:, None], _find_landing_places(state, is_free, positions_m, parameters), guides_m)
     wanted = _extend(plans, guides_m, parameters)
     lower_m = np.maximum(wanted.lower_m, bounds.lower_m)
     upper_m = np.minimum(wanted.upper_m, bounds.upper_m)
-    avoids = ~must_land[:, None, None]
-    lower_m = np.where(avoids, np.maximum(lower_m, away.lower_m), lower_m)
-    upper_m = np.where(avoids, np.minimum(upper_m, away.upper_m), upper_m)
-    is_threatened = np.isfinite(away.lower_m).any(axis=(1, 2)) | np.isfinite(away.upper_m).any(axis=(1, 2))
-    is_new = ~is_free & bounds.is_divided & (state.is_decided | is_threatened | must_land)
+    # Away from obstacles, but never so far that the plan in progress is cut
+    lower_m = np.maximum(lower_m, np.minimum(away.lower_m, plans.lower_m))
+    upper_m = np.minimum(upper_m, np.maximum(away.upper_m, plans.upper_m))
+    # A vehicle that must land has its first such cell at once
+    is_told = np.array([cell.land for cell in state.newest], dtype=bool)
+    is_new = ~is_free & bounds.is_divided & (state.is_decided | (must_land & ~is_told))
     cells = Boxes(lower_m, upper_m)
     is_new &= ~cells.is_empty
     newest = tuple(
@@ -231,3 +231,21 @@ def _avoid_obstacles(
         np.maximum.at(lower_m, at, np.where(is_below, -np.inf, high_m[stage, axis]))
     must_land &= ~is_free
     return Bounds(lower_m, upper_m, ~must_land), must_land
+
+
+def _find_landing_places(
+    state: CoordinatorState, is_free: Flags, positions_m: Array, parameters: CellParameters
+) -> Array:
+    """Find places (N, 3) on the floor, beside the ways of the obstacles."""
+    places_m = positions_m.copy()
+    for i in np.flatnonzero(is_free):
+        report = state.reports[i]
+        offsets_m, way_mps = (positions_m - report.plan.mean_m[0])[:, :2], report.velocity_mps[:2]
+        # Place of the way that is nearest to each vehicle: t = o'v / v'v
+        ahead_s = offsets_m @ way_mps / max(float(way_mps @ way_mps), MIN_SPEED_MPS**2)
+        beside_m = offsets_m - np.clip(ahead_s, 0.0, None)[:, None] * way_mps
+        length_m = np.linalg.norm(beside_m, axis=1, keepdims=True)
+        places_m[:, :2] += LANDING_WAY_M * beside_m / np.maximum(length_m, MIN_WAY_M)
+    places_m = np.clip(places_m, parameters.room_lower_m, parameters.room_upper_m)
+    places_m[:, 2] = parameters.room_upper_m[2]
+    return places_m

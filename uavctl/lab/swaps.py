@@ -220,7 +220,7 @@ class SwapWorld:
             self.plans += 1
             self.slack_plans += vehicle.plan.slack > 1e-6
         report = Report(
-            self._describe_plan(vehicle).advance(self.step),
+            self._describe_plan(vehicle.plan, vehicle.plan_step).advance(self.step),
             vehicle.estimate[list(self.design.plant.velocity_index)],
             vehicle.choice.cell.number,
             vehicle.choice.decided,
@@ -234,17 +234,24 @@ class SwapWorld:
         if self.case.method == "voronoi":
             vehicle.choice = CellChoice(cell, cell.number)
             return
-        vehicle.choice = decide_cell(vehicle.choice, cell, self.step, self._describe_plan(vehicle))
+        before = vehicle.choice
+        vehicle.choice = decide_cell(before, cell, self.step, self._describe_plan(vehicle.plan, vehicle.plan_step))
+        if vehicle.choice.cell is not cell and vehicle.age < self.design.horizon:
+            # The plan in progress has changed since its report: a new one may keep the cell
+            answer = self._solve(vehicle.estimate, vehicle.age, cell, self.step)
+            vehicle.choice = decide_cell(before, cell, self.step, self._describe_plan(answer, self.step))
+            if vehicle.choice.cell is cell:
+                vehicle.plan, vehicle.plan_step = answer, self.step
         self.decided += 1
         self.refused += vehicle.choice.cell is not cell
         if vehicle.choice.cell.land:
             self.landed.add(i)
 
-    def _describe_plan(self, vehicle: _Vehicle) -> Plan:
+    def _describe_plan(self, answer: Answer, step: int) -> Plan:
         rows, index = self._find_rows(), list(self.design.plant.position_index)
         # The larger back-off of the two sides
-        margin_m = np.maximum(vehicle.plan.backoff_x[:, rows[0]], vehicle.plan.backoff_x[:, rows[1]])
-        return Plan(vehicle.plan_step, vehicle.plan.states[:, index], margin_m)
+        margin_m = np.maximum(answer.backoff_x[:, rows[0]], answer.backoff_x[:, rows[1]])
+        return Plan(step, answer.states[:, index], margin_m)
 
     def _find_rows(self) -> tuple[list[int], list[int]]:
         """Find the rows of the upper and lower limits of the positions."""
