@@ -14,7 +14,7 @@ from enum import Enum
 import numpy as np
 
 from uavctl.arrays import Array, Flags
-from uavctl.fleet.boxes import DOWNWASH
+from uavctl.fleet.boxes import DOWNWASH, ROUNDING_M
 
 
 class Move(Enum):
@@ -68,72 +68,81 @@ def choose_guides(positions_m: Array, goals_m: Array, ways: Ways) -> Array:
     guides_m = goals_m.copy()
     way_m = (goals_m - positions_m)[:, LEVEL]
     length_m = np.linalg.norm(way_m, axis=1)
+    ahead = way_m / np.maximum(length_m, ARRIVED_M)[:, None]
+    offsets_m = (positions_m[None] - positions_m[:, None])[..., LEVEL]
+    is_other = np.abs(positions_m[None, :, 2] - positions_m[:, None, 2]) < DOWNWASH * ways.distance_m
+    np.fill_diagonal(is_other, False)
+    look_m = np.minimum(LOOK_AHEAD_M, length_m + ways.width_m)[:, None]
+    is_blocking = is_other & _is_on_way(*_project(offsets_m, ahead), look_m, ways.width_m)
+    blockers = np.where(is_blocking, np.linalg.norm(offsets_m, axis=2), np.inf).argmin(axis=1)
+    is_free = _find_free(positions_m[:, LEVEL], ahead, offsets_m, is_other, ways)
     asked: dict[int, int] = {}  # vehicle that waits for a vehicle at its goal
-    for i in np.flatnonzero(length_m > ARRIVED_M).tolist():
-        move, ahead, blocker = _choose_own_move(i, positions_m, way_m, length_m, ways)
+    for i in np.flatnonzero(is_blocking.any(axis=1) & (length_m > ARRIVED_M)).tolist():
+        blocker = int(blockers[i])
+        move = choose_move(_describe_free(is_free[i]), i < blocker and bool(length_m[blocker] > ARRIVED_M))
         if move is Move.WAIT and length_m[blocker] < PASS_M:
             asked.setdefault(blocker, i)
-        if blocker >= 0:
-            guides_m[i, LEVEL] = positions_m[i, LEVEL] + _find_step_m(move, ahead)
+        guides_m[i, LEVEL] = positions_m[i, LEVEL] + _find_step_m(move, ahead[i])
     for i, waiting in asked.items():
-        offset_m = (positions_m[waiting] - positions_m[i])[LEVEL]
-        ahead = offset_m / np.linalg.norm(offset_m)
-        is_free = _find_free(i, positions_m, ahead, ways) | {Move.AHEAD: False}
-        guides_m[i, LEVEL] = positions_m[i, LEVEL] + _find_step_m(choose_move(is_free, False), ahead)
+        towards = offsets_m[i, waiting] / np.linalg.norm(offsets_m[i, waiting])
+        place_m, row = positions_m[i : i + 1, LEVEL], slice(i, i + 1)
+        is_free = _find_free(place_m, towards[None], offsets_m[row], is_other[row], ways)
+        move = choose_move(_describe_free(is_free[0]), False)
+        guides_m[i, LEVEL] = positions_m[i, LEVEL] + _find_step_m(move, towards)
     return guides_m
 
 
-def _choose_own_move(i: int, positions_m: Array, way_m: Array, length_m: Array, ways: Ways) -> tuple[Move, Array, int]:
-    """Choose the move of a vehicle on its way; also return its direction (2,) and the vehicle ahead, -1 for none."""
-    ahead = way_m[i] / length_m[i]
-    offsets_m = _find_offsets(i, positions_m, ways)
-    look_m = min(LOOK_AHEAD_M, float(length_m[i]) + ways.width_m)
-    is_blocking = _find_blocking(offsets_m, ahead, look_m, ways.width_m)
-    if not is_blocking.any():
-        return Move.AHEAD, ahead, -1
-    blocker = int(np.where(is_blocking, np.linalg.norm(offsets_m, axis=1), np.inf).argmin())
-    is_free = _find_free(i, positions_m, ahead, ways) | {Move.AHEAD: False}
-    return choose_move(is_free, i < blocker and bool(length_m[blocker] > ARRIVED_M)), ahead, blocker
+def _describe_free(is_free: Flags) -> dict[Move, bool]:
+    """Describe the directions (4,) that are free; the way ahead is blocked."""
+    return {Move.AHEAD: False, Move.RIGHT: bool(is_free[1]), Move.BACK: bool(is_free[2]), Move.LEFT: bool(is_free[3])}
 
 
-def _find_free(i: int, positions_m: Array, ahead: Array, ways: Ways) -> dict[Move, bool]:
-    """Find the directions in which a vehicle may move."""
-    offsets_m, place_m = _find_offsets(i, positions_m, ways), positions_m[i, LEVEL]
-    directions = {move: _turn(ahead, move.value) for move in Move if move is not Move.WAIT}
-    return {
-        move: _is_inside(place_m + PASS_M * direction, ways)
-        and not _find_blocking(offsets_m, direction, PASS_M, ways.width_m).any()
-        for move, direction in directions.items()
-    }
+def _find_free(places_m: Array, ahead: Array, offsets_m: Array, is_other: Flags, ways: Ways) -> Flags:
+    """Find whether M vehicles may move in each direction, by quarter turns to the right (M, 4).
+
+    Args:
+        places_m: (M, 2).
+        ahead: Directions of the ways (M, 2).
+        offsets_m: Offsets of all vehicles (M, N, 2).
+        is_other: Which of them count (M, N).
+    """
+    along_m, across_m = _project(offsets_m, ahead)
+    right = _turn(ahead)
+    is_free = []
+    for direction, forward_m, aside_m in (
+        (ahead, along_m, across_m),
+        (right, across_m, along_m),
+        (-ahead, -along_m, across_m),
+        (-right, -across_m, along_m),
+    ):
+        end_m = places_m + PASS_M * direction
+        is_inside = ((end_m > ways.room_lower_m[LEVEL]) & (end_m < ways.room_upper_m[LEVEL])).all(axis=1)
+        is_free.append(is_inside & ~(is_other & _is_on_way(forward_m, aside_m, PASS_M, ways.width_m)).any(axis=1))
+    return np.column_stack(is_free)
 
 
-def _find_offsets(i: int, positions_m: Array, ways: Ways) -> Array:
-    """Find the horizontal offsets (N, 2) of all vehicles; infinite for itself and those far above or below."""
-    offsets_m = positions_m - positions_m[i]
-    is_other = np.abs(offsets_m[:, 2]) < DOWNWASH * ways.distance_m
-    is_other[i] = False
-    return np.where(is_other[:, None], offsets_m[:, LEVEL], np.inf)
+def _turn(direction: Array) -> Array:
+    """Turn directions (…, 2), north and east, to the right by a quarter turn."""
+    return np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
+
+
+def _project(offsets_m: Array, ahead: Array) -> tuple[Array, Array]:
+    """Project offsets (M, N, 2) on directions (M, 2) and to the right of them: (M, N), (M, N)."""
+    along_m = (offsets_m * ahead[:, None]).sum(axis=2)
+    across_m = (offsets_m * _turn(ahead)[:, None]).sum(axis=2)
+    return along_m, across_m
+
+
+def _is_on_way(forward_m: Array, aside_m: Array, length_m: Array | float, width_m: float) -> Flags:
+    """Return which offsets are on a way of this length and half width; one that is abeam is not."""
+    return np.asarray((forward_m > ROUNDING_M) & (forward_m < length_m) & (np.abs(aside_m) < width_m))
 
 
 def _find_step_m(move: Move, ahead: Array) -> Array:
     """Find the way (2,) of a move."""
-    return np.zeros(2) if move is Move.WAIT else PASS_M * _turn(ahead, move.value)
-
-
-def _turn(direction: Array, quarters: int) -> Array:
-    """Turn a direction (2,), north and east, to the right by quarter turns."""
-    for _ in range(quarters):
-        direction = np.array([-direction[1], direction[0]])
-    return direction
-
-
-def _find_blocking(offsets_m: Array, direction: Array, length_m: float, width_m: float) -> Flags:
-    """Find which offsets (n, 2) are on a way of this direction (2,), length and half width."""
-    near_m = np.where(np.isfinite(offsets_m), offsets_m, 0.0)  # a vehicle itself is not on its way
-    along_m, across_m = near_m @ direction, near_m @ _turn(direction, 1)
-    return np.asarray((along_m > 0.0) & (along_m < length_m) & (np.abs(across_m) < width_m))
-
-
-def _is_inside(place_m: Array, ways: Ways) -> bool:
-    """Return whether a place (2,) is inside of the room."""
-    return bool((place_m > ways.room_lower_m[LEVEL]).all() and (place_m < ways.room_upper_m[LEVEL]).all())
+    if move is Move.WAIT:
+        return np.zeros(2)
+    direction = ahead
+    for _ in range(move.value):
+        direction = _turn(direction)
+    return PASS_M * direction
