@@ -163,9 +163,10 @@ def test_a_page_s_configurations_load(page: str) -> None:
             load_config("room-px4", overrides)
 
 
-def test_the_page_of_fleets_shows_its_example() -> None:
-    (shown,) = find_blocks("docs/fleet.md", "toml")
-    assert shown == (ROOT / "docs/examples/duo.toml").read_text(encoding="utf-8")
+def test_the_page_of_fleets_shows_its_examples() -> None:
+    fleet, radio = find_blocks("docs/fleet.md", "toml")
+    assert fleet == (ROOT / "docs/examples/duo.toml").read_text(encoding="utf-8")
+    assert radio in (ROOT / "docs/examples/radio.toml").read_text(encoding="utf-8")
 
 
 FIRST = "docs/first-flight.md"
