@@ -34,7 +34,7 @@ from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitDetector
 from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, decode_scan
-from uavctl.mavlink.framing import scan_single_frame
+from uavctl.mavlink.framing import SkipReason, scan_single_frame
 from uavctl.mavlink.message_layout import MessageLayout
 from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, StatusText
 from uavctl.mavlink.profile import describe_mode, find_autopilot_name
@@ -238,12 +238,13 @@ class _Reader:
         """Take one packet."""
         self._last_ns = packet.at_ns
         scan = scan_single_frame(packet.data)
+        if scan.frames or SkipReason.UNKNOWN in scan.bad:
+            self._senders.take(packet.data)
         for frame in scan.frames:
             system = get_system_id(frame.data)
             name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"
             self.counted[name] += 1
             self._spans_ns[name] = self._spans_ns.get(name, (packet.at_ns, 0))[0], packet.at_ns
-            self._senders.take(frame.data)
             if frame.message_id == _SETPOINT:
                 self._take_setpoint(frame.data, packet.at_ns)
             elif self._is_vehicle(system):
@@ -524,16 +525,20 @@ def list_facts(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     if info.battery_v is not None:
         yield "battery", "{:.2f} V at the start, {:.2f} V at the end".format(*info.battery_v)
     for sender in info.senders:
-        kind, lost = (
-            f" ({sender.kind})" if sender.kind else "",
-            f"; {sender.missing} more did not come" if sender.missing else "",
-        )
-        yield f"from {sender.system}, component {sender.component}{kind}", f"{count(sender.messages, 'message')}{lost}"
+        kind = f" ({sender.kind})" if sender.kind else ""
+        messages = f"{count(sender.messages, 'message')}{_format_missing(sender)}"
+        yield f"from {sender.system}, component {sender.component}{kind}", messages
     yield "parameters sent", str(len(info.parameters))
     if info.bad:
         yield "passed over", ", ".join(f"{number} {reason}" for reason, number in info.bad.items())
     if info.missing:
         yield "missing", ", ".join(info.missing)
+
+
+def _format_missing(sender: LogSender) -> str:
+    if sender.disorder:
+        return "; its numbers are of several connections, so that losses cannot be counted"
+    return f"; {sender.missing} more are not in the recording (lost, or sent elsewhere)" if sender.missing else ""
 
 
 def format_rate(info: MavlinkFlightInfo, message: str) -> str:

@@ -7,7 +7,7 @@ send heartbeats too. Header of a frame: https://mavlink.io/en/guide/serializatio
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -28,7 +28,9 @@ _STATES = frozenset(
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_VFR_HUD,
     }
 )  # fmt: skip
-_MAX_MISSING = 128  # numbers of a sequence of 256 that are missing at once; more is disorder
+_MAX_MISSING = 128  # numbers of a sequence of 256 that are missing at once; more is a step back
+_MAX_LATE = 32  # numbers that a late message lies back: 12 in flights that were looked at
+_MAX_DISORDER = 0.01  # steps back further than that, of the messages: a sender that starts anew makes one
 
 
 class LogSender(msgspec.Struct, frozen=True, kw_only=True):
@@ -38,7 +40,8 @@ class LogSender(msgspec.Struct, frozen=True, kw_only=True):
     component: int
     kind: str  # of MAV_TYPE by its heartbeats; empty without any
     messages: int
-    missing: int  # by the numbers of its messages: lost on the way to the recorder
+    missing: int  # numbers of messages that are not in the recording: lost, or sent elsewhere; 0 in disorder
+    disorder: bool = False  # several sequences of numbers, as of a program with several connections
 
 
 @dataclass(frozen=True)
@@ -114,23 +117,46 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
     return ChosenVehicle(system, None if system is None else vehicles.get(system), others)
 
 
+@dataclass
+class _Sequence:
+    """Numbers of one sender's messages, modulo 256."""
+
+    newest: int
+    messages: int = 0
+    steps_back: int = 0  # that are no late message
+    missing: int = 0
+    open_numbers: set[int] = field(default_factory=set)  # missing among the last `_MAX_LATE`
+
+    def take(self, number: int) -> None:
+        """Take the number of the next message."""
+        self.messages += 1
+        step = (number - self.newest) % 256
+        if number in self.open_numbers:
+            self.open_numbers.remove(number)
+            self.missing -= 1
+        elif 0 < step <= _MAX_MISSING + 1:
+            self.missing += step - 1
+            self.open_numbers |= {(self.newest + ahead) % 256 for ahead in range(1, step)}
+            self.newest = number
+            self.open_numbers = {one for one in self.open_numbers if (number - one) % 256 <= _MAX_LATE}
+        else:
+            self.steps_back += 1
+            self.newest = number
+            self.open_numbers.clear()
+
+
 class SenderCounter:
     """Counts the frames of each component."""
 
     def __init__(self) -> None:
-        self._last: dict[tuple[int, int], int] = {}
-        self._messages: dict[tuple[int, int], int] = {}
-        self._missing: dict[tuple[int, int], int] = {}
+        self._sequences: dict[tuple[int, int], _Sequence] = {}
         self._kinds: dict[tuple[int, int], int] = {}
 
     def take(self, frame: bytes) -> None:
-        """Take a whole frame."""
+        """Take a whole frame, of a known message or not."""
         at = 4 if frame[0] == mavlink.PROTOCOL_MARKER_V2 else 2
-        number, sender = frame[at], (frame[at + 1], frame[at + 2])
-        skipped = (number - self._last.get(sender, number - 1) - 1) % 256
-        self._last[sender] = number
-        self._messages[sender] = self._messages.get(sender, 0) + 1
-        self._missing[sender] = self._missing.get(sender, 0) + (skipped if skipped <= _MAX_MISSING else 0)
+        sender = (frame[at + 1], frame[at + 2])
+        self._sequences.setdefault(sender, _Sequence(newest=(frame[at] - 1) % 256)).take(frame[at])
 
     def take_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Take the type that a sender reports."""
@@ -138,11 +164,12 @@ class SenderCounter:
 
     def listed(self) -> Iterable[LogSender]:
         """Return the senders, by system and component."""
-        for (system, component), messages in sorted(self._messages.items()):
+        for (system, component), sequence in sorted(self._sequences.items()):
             kind = self._kinds.get((system, component))
+            disorder = sequence.steps_back > max(1.0, _MAX_DISORDER * sequence.messages)
             yield LogSender(
                 system=system, component=component, kind="" if kind is None else _get_type_name(kind),
-                messages=messages, missing=self._missing[system, component],
+                messages=sequence.messages, missing=0 if disorder else sequence.missing, disorder=disorder,
             )  # fmt: skip
 
 

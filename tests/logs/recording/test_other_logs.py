@@ -15,6 +15,7 @@ from ulog_writer import UlogWriter, message
 
 from logs.recording.file_kind import FileKind, detect_kind
 from logs.recording.mavlink_flight import read_flight
+from logs.recording.senders import LogSender
 from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.cli.app import run
@@ -111,6 +112,59 @@ def test_numbers_that_are_missing_are_counted_by_sender(tmp_path: Path) -> None:
     assert all(one.missing == 0 for one in whole.values())
     assert sum(one.missing for one in found.values()) == 10
     assert found[1, 154].kind == "gimbal"
+
+
+def find_sender(path: Path, system: int) -> LogSender:
+    return next(one for one in read_flight(path).info.senders if one.system == system)
+
+
+@pytest.mark.parametrize("unknown", [0x0123FF, 410])
+def test_messages_of_unknown_ids_are_not_missing(tmp_path: Path, unknown: int) -> None:
+    """Every third frame of the autopilot is of an id that the dialect does not have."""
+    assert unknown not in mavlink.mavlink_map
+    log = Log()
+    log.put(0.0, 1, 1, beat())
+    for step in range(600):
+        log.put(0.1 * step, 1, 1, place(0.1 * step, 1.0, 0.0, -1.0))
+        if step % 3 == 0:
+            at_us, frame = log.frames[-1]
+            log.frames[-1] = at_us, frame[:7] + unknown.to_bytes(3, "little") + frame[10:]
+    sender = find_sender(log.save(tmp_path / "a.tlog"), 1)
+    assert (sender.messages, sender.missing, sender.disorder) == (601, 0, False)
+
+
+def test_messages_that_come_late_are_not_missing(tmp_path: Path) -> None:
+    log = Log()
+    for step in range(900):
+        log.put(0.1 * step, 1, 1, beat())
+    del log.frames[500:520]
+    stamps = [at_us for at_us, _ in log.frames]
+    for at, back in ((50, 1), (255, 2), (600, 12), (700, 30)):
+        log.frames.insert(at, log.frames.pop(at - back))
+    log.frames = [(at_us, frame) for at_us, (_, frame) in zip(stamps, log.frames, strict=True)]
+    sender = find_sender(log.save(tmp_path / "a.tlog"), 1)
+    assert (sender.messages, sender.missing, sender.disorder) == (880, 20, False)
+
+
+def test_a_sender_with_two_sequences_has_no_number_of_losses(tmp_path: Path) -> None:
+    """One program on two connections numbers the messages of each."""
+    first, second, whole = Log(), Log(), Log()
+    for step in range(600):
+        first.put(0.1 * step, 1, 1, beat())
+        if step % 3 == 0:
+            second.put(0.1 * step, 1, 1, beat())
+    whole.frames = sorted(first.frames + second.frames, key=lambda frame: frame[0])
+    sender = find_sender(whole.save(tmp_path / "a.tlog"), 1)
+    assert (sender.messages, sender.missing, sender.disorder) == (800, 0, True)
+
+
+def test_a_sender_that_starts_anew_is_one_sequence(tmp_path: Path) -> None:
+    log = Log()
+    for step in range(100):
+        log.put(0.1 * step, 1, 1, beat())
+    log.frames += [(at_us + 20_000_000, frame) for at_us, frame in log.frames]
+    sender = find_sender(log.save(tmp_path / "a.tlog"), 1)
+    assert (sender.messages, sender.missing, sender.disorder) == (200, 0, False)
 
 
 def test_stamps_that_are_missing_or_all_the_same_are_refused(tmp_path: Path) -> None:
