@@ -41,6 +41,7 @@ class Cause(StrEnum):
     RELAY_ATTITUDE = "relay-attitude"
     RELAY_SILENT = "relay-silent"
     SILENCE = "silence"
+    SETPOINTS_SILENT = "setpoints-silent"
     ENVELOPE = "let-go"
     NOT_AS_ORDERED = "not-as-ordered"
     BEGIN_REFUSED = "begin-refused"
@@ -155,6 +156,7 @@ CAUSES: dict[Cause, CauseText] = {
     _C.RELAY_ATTITUDE: CauseText(_R.POSITIONS, BAD, "Attitude of poses wrong"),
     _C.RELAY_SILENT: CauseText(_R.POSITIONS, BAD, "Relay silent"),
     _C.SILENCE: CauseText(_R.POSITIONS, CAUTION, "No positions for a while"),
+    _C.SETPOINTS_SILENT: CauseText(_R.POSITIONS, CAUTION, "No setpoints for a while"),
     _C.ENVELOPE: CauseText(_R.ENDING, BAD, "Let go", "let go by the envelope"),
     _C.NOT_AS_ORDERED: CauseText(_R.ENDING, BAD, "Not as ordered"),
     _C.BEGIN_REFUSED: CauseText(_R.ENDING, BAD, "Refused by the vehicle"),

@@ -23,9 +23,12 @@ _ROOTS = (
     Cause.POSITIONS_ABSENT,
     Cause.FLOWN_BLIND,
     Cause.SILENCE,
+    Cause.SETPOINTS_SILENT,
     Cause.POSITIONS_APART,
     Cause.WIND,
 )
+# Effects that a cause explains. A fence or an empty battery comes of itself.
+_EXPLAINED = frozenset({Cause.VEHICLE_FAILSAFE, Cause.VEHICLE_POSITION_LOST})
 _EFFECTS = frozenset({CauseRank.LOST, CauseRank.FAILSAFE, CauseRank.TAKEN_OVER, CauseRank.ENDING})
 
 
@@ -78,12 +81,15 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: (_RANKS.index(CAUSES[finding.cause].rank), finding.at_s))
 
 
-def make_headline(findings: Iterable[Finding], outcome: str = "", reasons: Iterable[str] = ()) -> Headline:
+def make_headline(
+    findings: Iterable[Finding], outcome: str = "", reasons: Iterable[str] = (), *, root_first: bool = False
+) -> Headline:
     """Make the headline of findings, at least one: the gravest, its causes, and its effects.
 
     Args:
         outcome: A clause on how the flight ended and where it stayed.
-        why: Further sentences, below those on the other findings.
+        reasons: Further sentences, below those on the other findings.
+        root_first: Whether the line begins with the cause of a failsafe, if that cause was there before.
     """
     main_finding, *others = sort_findings(findings)
     words = CAUSES[main_finding.cause]
@@ -96,20 +102,24 @@ def make_headline(findings: Iterable[Finding], outcome: str = "", reasons: Itera
             and finding.at_s <= (main_finding.view_s or main_finding.at_s) + _MAX_CAUSE_DELAY_S
         ]
         root = min(candidates, key=lambda finding: _ROOTS.index(finding.cause), default=None)
+    shown = [main_finding, *((root,) if root else ())]
+    if root_first and main_finding.cause in _EXPLAINED and root and root.at_s < main_finding.at_s:
+        shown.reverse()
+    first, *rest = shown
     clauses = [
-        main_finding.text,
-        *((f"{CAUSES[root.cause].title.lower()}: {root.text}",) if root else ()),
+        first.text,
+        *(f"{CAUSES[finding.cause].title.lower()}: {finding.text}" for finding in rest),
         *((outcome,) if outcome else ()),
     ]
     return Headline(
         tone=main_finding.tone or words.tone,
-        word=words.title,
+        word=CAUSES[first.cause].title,
         text=f"{'; '.join(clauses)}.",
         reasons=(
             *(finding.sentence for finding in others if finding is not root and not _is_in_outcome(finding, outcome)),
             *reasons,
         ),
-        at_s=main_finding.at_s if main_finding.view_s is None else main_finding.view_s,
+        at_s=first.at_s if first.view_s is None else first.view_s,
         cause=main_finding.cause,
         causes=tuple(dict.fromkeys(finding.cause for finding in (main_finding, *others))),
     )

@@ -18,7 +18,7 @@ from logs.report.battery import find_battery_faults
 from logs.report.findings import Finding, Headline, make_headline, metres, seconds, sort_findings
 from logs.report.vehicle_texts import FAILSAFE_MODES, classify_texts
 from uavctl.arrays import Array
-from uavctl.cause import BAD, Cause
+from uavctl.cause import BAD, CAUTION, Cause
 from uavctl.mavlink.profile import PROFILES
 from uavctl.number_text import format_number
 from uavctl.records import Severity
@@ -34,12 +34,16 @@ _ESTIMATOR_TIMEOUT_S = 5.0  # without a position: the soonest at which vehicles'
 _SOURCE_TIMEOUT_S = 2.0  # without a position of one source while another's come: it stopped
 _HEARTBEAT_TIMEOUT_S = 2.5  # of the vehicle: a heartbeat comes each second
 _MAX_PERIODS = 5.0  # usual times between its positions: one that comes seldom is no sign of silence
+_SETPOINT_TIMEOUT_S = 1.5  # without a setpoint: a heartbeat, by which the end of a mode is known late, and PX4's 0.5 s
+_MAX_SETPOINT_PERIOD_S = 0.5  # of setpoints that are a stream; a single place to fly to needs no other one
 _MIN_POSITIONS = 10  # positions of a source worth looking at
 _UNUSABLE_SHARE = 0.2  # of the stamps: more than come out of order, or twice, on any link
 _MAX_DELAY_MS = 1000.0  # positions later than this fly no vehicle
 _MIN_FROZEN_S, _MIN_MOTION_M = 1.0, 0.1  # the same value for so long, while its own position moved by so much
 _MAX_RMS_SHARE = 0.5  # of the radius of arrival, as of our own flights
 _MAX_MODE_TEXTS = 3  # sentences on modes
+_MAX_SHOWN_MODES = 12
+_EXTERNAL = frozenset(profile.external_mode for profile in PROFILES.values())
 _AUTOPILOT_MESSAGES = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE", "SYS_STATUS")
 
 
@@ -82,7 +86,12 @@ def derive_tlog_headline(flight: MavlinkFlight) -> Headline:
         return make_headline([arming, *others], reasons=sentences)
     findings = sort_findings(finding for rule in RULES for finding in rule(armed))
     reported_s = {finding.at_s for finding in findings if finding.cause in (Cause.MODE_LEFT, Cause.VEHICLE_FAILSAFE)}
-    return make_headline(findings or [_make_clear_finding(armed)], reasons=_describe_mode_exits(info, reported_s))
+    return make_headline(
+        findings or [_make_clear_finding(armed)],
+        outcome="; ".join(_describe_course(armed)),
+        reasons=(*_describe_mode_exits(armed, reported_s), *_describe_modes(info)),
+        root_first=True,
+    )
 
 
 def find_armed_spans(info: MavlinkFlightInfo) -> list[tuple[float, float]]:
@@ -105,7 +114,41 @@ def _make_clear_finding(armed: ArmedFlight) -> Finding:
         texts.append("the recording holds no position setpoints")
     if not len(flight.battery_v):
         texts.append("its battery is not known")
-    return Finding(Cause.NOTHING_FOUND, 0.0, "; ".join(texts))
+    return Finding(Cause.NOTHING_FOUND, 0.0, "; ".join(texts), tone=CAUTION if _ends_in_flight(armed) else "")
+
+
+def _ends_in_flight(armed: ArmedFlight) -> bool:
+    """Return whether the recording ends in an armed mode that takes setpoints."""
+    last = armed.info.modes[-1]
+    return last.armed and last.mode in _EXTERNAL
+
+
+def _describe_course(armed: ArmedFlight) -> Iterator[str]:
+    """Yield clauses on how far the vehicle went under setpoints, and in which mode the recording ends."""
+    own, furthest = armed.flight.own, (0.0, 0.0, "")
+    for begin_s, end_s, mode in _list_external_spans(armed):
+        inside = np.flatnonzero((own.t_s >= begin_s) & (own.t_s < end_s))
+        if len(inside):
+            distance_m = np.linalg.norm(own.position_m[inside] - own.position_m[inside[0]], axis=1)
+            index = int(distance_m.argmax())
+            furthest = max(furthest, (float(distance_m[index]), float(own.t_s[inside[index]]), mode))
+    distance_max_m, at_s, mode = furthest
+    if distance_max_m >= _MAX_DISAGREEMENT_M:
+        yield f"in {mode} it was at most {metres(distance_max_m)} from where that mode began, at {seconds(at_s)}"
+    last = armed.info.modes[-1]
+    if _ends_in_flight(armed):
+        yield f"the recording ends in flight ({last.mode}, armed)"
+    elif last.armed:
+        yield f"the recording ends while the vehicle is armed ({last.mode})"
+
+
+def _list_external_spans(armed: ArmedFlight) -> Iterator[tuple[float, float, str]]:
+    """Yield begin and end [s] of each armed span in a mode that takes setpoints, and that mode."""
+    modes = armed.info.modes
+    ends_s = [*(mode.at_s for mode in modes[1:]), armed.flight.duration_s]
+    for mode, end_s in zip(modes, ends_s, strict=True):
+        if mode.armed and mode.mode in _EXTERNAL:
+            yield mode.at_s, end_s, mode.mode
 
 
 def _find_texts(armed: ArmedFlight) -> Iterator[Finding]:
@@ -129,9 +172,11 @@ def _find_battery_fault(armed: ArmedFlight) -> Iterator[Finding]:
 
 def _find_failsafe_mode(armed: ArmedFlight) -> Iterator[Finding]:
     """Find a mode that a failsafe alone chooses."""
-    for mode in armed.info.modes:
+    for number, mode in enumerate(armed.info.modes):
         if mode.armed and mode.mode in FAILSAFE_MODES:
-            yield Finding(Cause.VEHICLE_FAILSAFE, mode.at_s, f"the vehicle went to {mode.mode} at {seconds(mode.at_s)}")
+            before = f" from {armed.info.modes[number - 1].mode}" if number else ""
+            text = f"the vehicle went{before} to {mode.mode} at {seconds(mode.at_s)}"
+            yield Finding(Cause.VEHICLE_FAILSAFE, mode.at_s, text)
             return
 
 
@@ -186,6 +231,21 @@ def _find_silence(armed: ArmedFlight) -> Iterator[Finding]:
         if begun_s >= track.t_s[0] and longest_s >= max(_SOURCE_TIMEOUT_S, silent_s + _HEARTBEAT_S):
             text = f"{source} stopped for {seconds(longest_s)}, from {seconds(begun_s)} on, while others went on"
             yield Finding(Cause.RELAY_SILENT, begun_s, text)
+
+
+def _find_setpoint_gap(armed: ArmedFlight) -> Iterator[Finding]:
+    """Find the longest time without a setpoint, after a stream of them, in a mode that takes setpoints."""
+    t_s, longest = armed.flight.setpoint_t_s, (0.0, 0.0, "")
+    for begin_s, end_s, mode in _list_external_spans(armed):
+        edges = np.append(t_s[(t_s >= begin_s) & (t_s < end_s)], end_s)
+        gaps_s = np.diff(edges)
+        if len(gaps_s) >= _MIN_POSITIONS and np.median(gaps_s) <= _MAX_SETPOINT_PERIOD_S:
+            index = int(gaps_s.argmax())
+            longest = max(longest, (float(gaps_s[index]), float(edges[index]), mode))
+    gap_s, since_s, mode = longest
+    if gap_s > _SETPOINT_TIMEOUT_S:
+        text = f"none came for {seconds(gap_s)}, from {seconds(since_s)} on ({mode})"
+        yield Finding(Cause.SETPOINTS_SILENT, since_s, text)
 
 
 def _measure_silence(armed: ArmedFlight) -> tuple[float, float]:
@@ -289,10 +349,9 @@ def _find_track_error(armed: ArmedFlight) -> Iterator[Finding]:
     before, as a trajectory's do; else each place counts from the arrival there on.
     """
     flight = armed.flight
-    external = {profile.external_mode for profile in PROFILES.values()}
     t_s = flight.setpoint_t_s
     is_kept = np.isfinite(flight.setpoint_m).all(axis=1) & armed.inside(t_s).astype(np.bool_)
-    is_kept &= np.array([armed.mode_at(at_s) in external for at_s in t_s], dtype=np.bool_)
+    is_kept &= np.array([armed.mode_at(at_s) in _EXTERNAL for at_s in t_s], dtype=np.bool_)
     if is_kept.sum() < _MIN_POSITIONS or len(flight.own.t_s) < _MIN_POSITIONS:
         return
     at_s, setpoint_m = t_s[is_kept], flight.setpoint_m[is_kept]
@@ -313,13 +372,12 @@ def _find_track_error(armed: ArmedFlight) -> Iterator[Finding]:
 
 def _find_mode_exit(armed: ArmedFlight) -> Iterator[Finding]:
     """Find where it left the mode that takes setpoints for one that is no landing."""
-    external = {profile.external_mode for profile in PROFILES.values()}
     landing = {mode for profile in PROFILES.values() for mode in profile.landing_modes}
     failsafe = {Cause.VEHICLE_FENCE, Cause.BATTERY_LOW, Cause.VEHICLE_POSITION_LOST, Cause.VEHICLE_FAILSAFE}
     if any(finding.cause in failsafe for finding in (*_find_texts(armed), *_find_failsafe_mode(armed))):
         return
     for before, after in pairwise(armed.info.modes):
-        if before.armed and after.armed and before.mode in external and after.mode not in landing | external:
+        if before.armed and after.armed and before.mode in _EXTERNAL and after.mode not in landing | _EXTERNAL:
             text = f"from {before.mode} to {after.mode} at {seconds(after.at_s)}; the requester is unknown"
             yield Finding(Cause.MODE_LEFT, after.at_s, text)
             return
@@ -338,17 +396,31 @@ def _find_second_vehicle(armed: ArmedFlight) -> Iterator[Finding]:
         yield Finding(Cause.SECOND_VEHICLE, 0.0, text)
 
 
-def _describe_mode_exits(info: MavlinkFlightInfo, reported_s: Container[float]) -> Iterator[str]:
+def _describe_mode_exits(armed: ArmedFlight, reported_s: Container[float]) -> Iterator[str]:
     """Yield exits from modes that take setpoints, but for the times that the findings report."""
-    external = {profile.external_mode for profile in PROFILES.values()}
     exits = [
         (before, after)
-        for before, after in pairwise(info.modes)
-        if before.armed and before.mode in external and after.mode != before.mode and after.at_s not in reported_s
+        for before, after in pairwise(armed.info.modes)
+        if before.armed and before.mode in _EXTERNAL and after.mode != before.mode and after.at_s not in reported_s
     ]
+    setpoint_t_s = armed.flight.setpoint_t_s
     for before, after in exits[:_MAX_MODE_TEXTS]:
         disarmed_text = "" if after.armed else ", disarmed"
-        yield f"The vehicle left {before.mode} for {after.mode} at {seconds(after.at_s)}{disarmed_text}."
+        sent_s = setpoint_t_s[(setpoint_t_s >= before.at_s) & (setpoint_t_s < after.at_s)]
+        stopped = len(sent_s) and after.at_s - sent_s[-1] > BLIND_S
+        setpoint_text = f"; the last setpoint came at {seconds(float(sent_s[-1]))}" if stopped else ""
+        yield (
+            f"The vehicle left {before.mode} for {after.mode} at {seconds(after.at_s)}{disarmed_text}{setpoint_text}."
+        )
+
+
+def _describe_modes(info: MavlinkFlightInfo) -> Iterator[str]:
+    """Yield a sentence on the modes while armed, if there are more than two."""
+    modes = [mode for mode in info.modes if mode.armed]
+    if len(modes) > 2:
+        shown = ", ".join(f"{mode.mode} {seconds(mode.at_s)}" for mode in modes[:_MAX_SHOWN_MODES])
+        more = f", and {len(modes) - _MAX_SHOWN_MODES} more" if len(modes) > _MAX_SHOWN_MODES else ""
+        yield f"Modes while armed, from: {shown}{more}."
 
 
 RULES: tuple[Callable[[ArmedFlight], Iterator[Finding]], ...] = (
@@ -358,6 +430,7 @@ RULES: tuple[Callable[[ArmedFlight], Iterator[Finding]], ...] = (
     _find_vehicle_silence,
     _find_position_loss,
     _find_silence,
+    _find_setpoint_gap,
     _find_frozen_source,
     _find_unusable_stamps,
     _find_position_disagreement,

@@ -16,6 +16,7 @@ from loopback_rig import lockstep
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from synthetic_flight import fly
 from synthetic_scene import room
+from text_numbers import find_numbers
 
 from logs.recording.flight import FlightData
 from logs.recording.mavlink_flight import read_flight
@@ -28,7 +29,7 @@ from logs.report.tlog_headline import derive_tlog_headline
 from logs.report.vehicle_texts import classify_text
 from logs.report.verdicts import judge_flight
 from uavctl.account import make_ending
-from uavctl.cause import CAUSES, GOOD, Cause
+from uavctl.cause import CAUSES, CAUTION, GOOD, Cause
 from uavctl.event_codes import EventCode
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.records import ControlMode, Event, LinkStats, RelayStats, Severity, VehicleStatus
@@ -499,3 +500,66 @@ def test_setpoints_that_were_not_followed(tmp_path: Path, off_m: float) -> None:
 
     headline = written(tmp_path, [*course(), *((0.1 * n, 245, wanted(n)) for n in range(120))])
     assert (headline.cause is Cause.OFF_TRACK) == bool(off_m)
+
+
+def send_setpoints(begin_s: float, end_s: float) -> list[tuple[float, int, Any]]:
+    """A stream of acceleration setpoints at 10 Hz."""
+    wanted = mavlink.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 2111, *[0.0] * 11)
+    return [(0.1 * n, 245, wanted) for n in range(round(10 * begin_s), round(10 * end_s))]
+
+
+@pytest.mark.parametrize(("paused_s", "resumed_s", "silent"), [(5.0, 5.5, False), (5.0, 8.0, True), (9.0, 12.0, True)])
+def test_setpoints_that_pause_under_a_mode_that_takes_them(
+    tmp_path: Path, paused_s: float, resumed_s: float, silent: bool
+) -> None:
+    sent = [*send_setpoints(1.0, paused_s), *send_setpoints(resumed_s, 12.0)]
+    headline = written(tmp_path, [*course(), *sent])
+    assert (headline.cause is Cause.SETPOINTS_SILENT) == silent
+    assert not silent or headline.at_s == pytest.approx(paused_s - 0.1)
+
+
+def test_setpoints_of_one_moment_and_of_another_mode_do_not_pause(tmp_path: Path) -> None:
+    """A single place needs no stream, and what stops as the vehicle lands was to stop."""
+    assert Cause.SETPOINTS_SILENT not in written(tmp_path, [*course(), *send_setpoints(1.0, 1.1)]).causes
+    landed = [(t, s, beat(9) if isinstance(m, mavlink.MAVLink_heartbeat_message) and t > 6.5 else m)
+              for t, s, m in course()]  # fmt: skip
+    assert Cause.SETPOINTS_SILENT not in written(tmp_path, [*landed, *send_setpoints(1.0, 6.2)]).causes
+
+
+def test_the_cause_of_a_failsafe_comes_before_it(tmp_path: Path) -> None:
+    """The relay stops at 4 s, and the vehicle's failsafe takes over at 7 s."""
+    relayed = [(t, 245, m) for t, s, m in course() if s == 20 and t < 4.0]
+    headline = written(tmp_path, [*course(), *relayed, spoken(7.0, b"Failsafe activated", 2)])
+    assert headline.cause is Cause.VEHICLE_FAILSAFE
+    assert headline.word == CAUSES[Cause.RELAY_SILENT].title and headline.at_s == pytest.approx(3.9)
+    fence = written(tmp_path, [*course(), *relayed, spoken(7.0, b"Max Alt fence breached", 5)])
+    assert fence.word == CAUSES[Cause.VEHICLE_FENCE].title
+
+
+def test_how_far_it_went_under_setpoints_is_told(tmp_path: Path) -> None:
+    """It moves north by 0.5 m/s, under GUIDED from 2 s to 9 s: 3.5 m, less the last tenth of a second."""
+    packets = [(t, s, beat(4 if 2.0 <= t < 9.0 else 9) if isinstance(m, mavlink.MAVLink_heartbeat_message) else m)
+               for t, s, m in course()]  # fmt: skip
+    numbers = find_numbers(written(tmp_path, packets).line)
+    assert numbers[numbers.index(8.9) - 1] == pytest.approx(0.5 * 6.9, abs=0.051)
+
+
+@pytest.mark.parametrize(("armed", "tone"), [(True, CAUTION), (False, GOOD)])
+def test_a_recording_that_ends_in_flight_is_not_good(tmp_path: Path, armed: bool, tone: str) -> None:
+    headline = written(tmp_path, [*course(), (12.0, 1, beat(armed=armed))])
+    assert (headline.cause, headline.tone) == (Cause.NOTHING_FOUND, tone)
+
+
+def test_each_mode_of_the_armed_vehicle_is_told(tmp_path: Path) -> None:
+    """A landing of a second after arming, then LOITER twice: times of the heartbeats."""
+    modes = {0: 9, 1: 4, 5: 5, 7: 4, 9: 5}  # LAND, GUIDED, LOITER
+    packets: list[tuple[float, int, Any]] = []
+    mode = 9
+    for t, s, m in course():
+        if isinstance(m, mavlink.MAVLink_heartbeat_message):
+            mode = modes.get(round(t), mode)
+            m = beat(mode)
+        packets.append((t, s, m))
+    headline = written(tmp_path, packets)
+    assert headline.cause is Cause.MODE_LEFT
+    assert any(find_numbers(reason) == pytest.approx([0.0, 1.0, 5.0, 7.0, 9.0]) for reason in headline.reasons)
