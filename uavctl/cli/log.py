@@ -125,7 +125,9 @@ def render_info(info: RecordingInfo) -> RenderableType:
 
 
 def _list_facts(info: RecordingInfo) -> Iterator[str]:
-    if not info.finished:
+    if not info.finished and not info.messages:
+        yield "not closed, and torn before its first whole chunk: nothing can be restored"
+    elif not info.finished:
         yield "not closed: `uavctl log recover` makes a clean file"
     elif info.damage:
         yield "damaged: `uavctl log recover` restores the rest"

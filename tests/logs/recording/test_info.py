@@ -98,6 +98,21 @@ def test_damage_is_told_not_raised(tmp_path: Path) -> None:
     assert 0.1 < gap.longest_gap_at_s < 0.3
 
 
+@pytest.mark.parametrize("size", [100, 200, 600, 2000, 10_000])
+def test_recovery_is_offered_where_it_restores_something(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "flight.mcap"
+    record_flight(path, 60)
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(path.read_bytes()[:size])
+    offered = "`uavctl log recover`" in shown(read_info(torn))
+    try:
+        recover(torn, tmp_path / "out.mcap")
+    except RecordingError:
+        assert not offered
+    else:
+        assert offered
+
+
 def test_torn_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 30)
