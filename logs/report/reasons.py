@@ -110,8 +110,8 @@ def _describe_model(e: FlightEvidence) -> Iterator[str]:
         sizes = ", ".join(f"{verdict.variance**0.5:.1f} times {verdict.axis}" for verdict in large_axes)
         yield (
             f"Errors of the forecast were larger than the model expects ({sizes}, over {large_axes[0].count} "
-            f"positions): "
-            "more wind or noisier positions than assumed."
+            "positions): more wind or noisier positions than assumed, or a wrong model (drag, lag or gain), which "
+            "`uavctl identify` measures."
         )
     elif correlated_axes:
         correlations = ", ".join(
