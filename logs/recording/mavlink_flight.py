@@ -559,5 +559,6 @@ def _format_delays(sent: SentPositions) -> str:
     if sent.delay_ms is None:
         return "; without stamps"
     median, p95, max_ms = sent.delay_ms
-    refused = f"; {count(sent.refused_stamps, 'stamp')} out of its clock" if sent.refused_stamps else ""
-    return f"; delay beyond the quickest {median:.0f} ms (median), {p95:.0f} (95 %), {max_ms:.0f} (largest){refused}"
+    refused = f"; {count(sent.refused_stamps, 'stamp')} that do not fit its clock" if sent.refused_stamps else ""
+    delays = f"median {median:.0f} ms, 95 % within {p95:.0f} ms, largest {max_ms:.0f} ms"
+    return f"; later than the quickest position by: {delays}{refused}"

@@ -126,6 +126,7 @@ RELATIVE_TOLERANCE = 1e-9
 WIRE_TOLERANCE = float(np.finfo(np.float32).eps)
 SLACK_TOLERANCE = 1e-6
 SETTLED_SHARE = 0.25
+ENDED_ROW = "Ended"  # row of a table: how the flight ended
 ARRIVED_M = 0.3  # from the target: as near as `mission.accept_m` asks for, unless it is configured otherwise
 BLIND_S, BLIND_STEPS = 0.5, 2.0  # without a position for longer, the reported place is a prediction
 
@@ -417,7 +418,7 @@ def list_summary_rows(summary: FlightSummary) -> list[tuple[str, str]]:
     source_text = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
     summary_rows = [
         ("Flown", f"{count(s.steps, 'step')}; {format_number(s.duration_s)} s{_describe_pace(s)}"),
-        ("Ended", f"{s.ending.sentence} The recording breaks off." if s.breaks_off else s.ending.sentence),
+        (ENDED_ROW, f"{s.ending.sentence} The recording breaks off." if s.breaks_off else s.ending.sentence),
         *((("Relay", s.ending.relay),) if s.ending.relay else ()),
         *(() if s.let_go is None else (("Let go", s.let_go),)),
         ("Positions", f"{s.received} received{lost_text}; {s.accepted} used, {s.rejected} refused"),
@@ -428,7 +429,7 @@ def list_summary_rows(summary: FlightSummary) -> list[tuple[str, str]]:
             f"{count(s.state_violations, 'step')}{_format_share(s.state_violations, s.steps)}{source_text}",
         ),
         ("Input outside limits", f"{count(s.input_violations, 'step')}{_format_share(s.input_violations, s.steps)}"),
-        ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
+        ("Solves", f"{s.solves}: {s.failed_solves} failed, {s.slack_used} with relaxed limits"),
         ("Plans found", _describe_methods(s)),
         (
             "Cost",
@@ -472,9 +473,9 @@ def _describe_distance(s: FlightSummary) -> str:
     final_text = f"{format_number(s.final_error_m)} m at the last flown step{f' ({prediction})' if prediction else ''}"
     if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
         return f"{final_text}; it never came within {ARRIVED_M:g} m"
-    period = "on the whole way" if s.trajectory else "from each arrival on"
+    period = "on the whole way" if s.trajectory else "after each arrival"
     max_text = f"at most {format_number(s.course_worst_m)} m, at {format_number(s.course_worst_s)} s"
-    return f"{format_number(s.course_rms_m)} m {period} (rms), {max_text}; {final_text}"
+    return f"{format_number(s.course_rms_m)} m (rms) {period}, {max_text}; {final_text}"
 
 
 def _format_share(part: int, whole: int) -> str:
