@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import msgspec
 import numpy as np
 import pytest
-from loopback_rig import MemorySink, flight, header, make_loop
+from loopback_rig import MemorySink, flight, header, make_loop, share_flight
 from whatif_rig import (
     EXACT,
     PAPER,
@@ -26,6 +27,8 @@ from whatif_rig import (
 from logs.recording.replay import replay
 from logs.recording.topics import encode
 from sim.vehicle.linear import LinearVehicle, make_linear_model
+from uavctl.account import make_ending
+from uavctl.cause import CAUSES, Cause
 from uavctl.errors import RecordingError
 from uavctl.lab.whatif.comparison import compare_reproduction, compute_max_distance_m, cut_entries, fit_model
 from uavctl.lab.whatif.flight import (
@@ -281,3 +284,22 @@ def test_without_the_truth_estimates_and_a_spline_take_its_place() -> None:
         len(put_back) > 5
         and max(math.dist(a.position_m, b.position_m) for a, b in zip(put_back, known, strict=True)) < 0.1
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", [Cause.PILOT, Cause.ENDED_BY_OPERATOR])
+def test_a_comparison_ends_where_the_pilot_takes_over(ending: Cause) -> None:
+    """The vehicle takes no setpoint from 4 s on, as the recording tells."""
+    whole = history(ROOM)
+    taken_ns = whole.flight.origin_ns + 4_000_000_000
+    taken = dataclasses.replace(
+        whole,
+        takes_setpoints={at_ns: takes and at_ns < taken_ns for at_ns, takes in whole.takes_setpoints.items()},
+        flight=dataclasses.replace(whole.flight, endings=(make_ending(ending, ""),)),
+    )
+    config, memory = load_case_config(ROOM), MemorySink()
+    design, controller = share_flight(config)
+    memory.put("/uavctl/header", 0, header(config, design))
+    course = refly(taken, config, controller, make_response(taken, config.plant), memory, lambda: 0)
+    assert 0 < taken_ns - course.end_ns <= whole.flight.tick_ns
+    assert (course.ended == CAUSES[Cause.PILOT].phrase) == (ending is Cause.PILOT)

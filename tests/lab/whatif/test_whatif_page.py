@@ -11,12 +11,20 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from report_rig import collect_figures, data
 from synthetic_scene import room
+from text_numbers import find_numbers
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import FlightSummary, summarise
 from logs.report.plots import DISPLAY_AXES
 from logs.report.svg import colour
-from uavctl.lab.whatif.comparison import ModelFit, Reproduction, WhatIf, describe_what_if, render_what_if_page
+from uavctl.lab.whatif.comparison import (
+    ModelFit,
+    Reproduction,
+    WhatIf,
+    describe_what_if,
+    make_comparison_rows,
+    render_what_if_page,
+)
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +108,16 @@ def test_another_link_is_listed_as_a_change(recorded: FlightData) -> None:
     summary = summarise(recorded, wall_s=None)
     (sentence,) = (text for text in describe_what_if(worse_link(summary)) if "link: loss=0.5" in text)
     assert "nothing" not in sentence
+
+
+def test_a_comparison_that_ends_early_tells_it_in_each_column(recorded: FlightData) -> None:
+    whole = worse_link(summarise(recorded, wall_s=None))
+    cut = msgspec.structs.replace(whole, compared_s=4.25, ended="the pilot has taken over")
+    rows = [{name: columns for name, *columns in make_comparison_rows(what_if)} for what_if in (whole, cut)]
+    changed = {name for name in rows[0] if rows[0][name] != rows[1][name]}
+    assert len(rows[0]) == len(rows[1]) and len(changed) == 1
+    (columns,) = (rows[1][name] for name in changed)
+    assert all(find_numbers(text) == [4.2] and cut.ended in text for text in columns)
 
 
 def test_the_age_is_drawn_against_the_horizon(recorded: FlightData, other: FlightData) -> None:

@@ -15,13 +15,13 @@ from msgspec.structs import replace
 
 from logs.recording.flight import FlightData
 from logs.recording.notes import RecorderNote
-from logs.recording.summary import FlightSummary, list_summary_rows
+from logs.recording.summary import ENDED_ROW, FlightSummary, list_summary_rows
 from logs.recording.topics import encode
 from logs.report import overlays
 from logs.report.page import Mark, PageSection, render_list, render_page, render_table
 from sim.vehicle.linear import CACHED_TRANSITIONS
 from uavctl.arrays import Array
-from uavctl.lab.whatif.flight import Entry, RecordedFlight, VehicleResponse
+from uavctl.lab.whatif.flight import END_OF_RECORDING, Entry, RecordedFlight, VehicleResponse
 from uavctl.records import Decision, Estimate, Plan, Record, Setpoint, Truth
 
 # What a what-if is worth, and its figures: the recorded flight, the same reproduced, the one that might have been.
@@ -223,6 +223,10 @@ def make_comparison_rows(what_if: WhatIf) -> Iterator[tuple[str, ...]]:
         for summary in (what_if.recorded, what_if.reproduced, what_if.what_if)
     ]
     columns = [dict(list_summary_rows(summary)) for summary in summaries]
+    if what_if.ended != END_OF_RECORDING:  # the summaries are of flights that were cut there
+        columns = [
+            {**column, ENDED_ROW: f"compared until {what_if.compared_s:.1f} s: {what_if.ended}"} for column in columns
+        ]
     for name in dict.fromkeys(name for column in columns for name in column):
         if name not in _COMPUTER_ROWS:
             yield (name, *(column.get(name, "-") for column in columns))

@@ -27,6 +27,7 @@ from sim.cameras import COMPONENT_ID, SYSTEM_ID
 from sim.channel import Channel
 from sim.vehicle.linear import CACHED_TRANSITIONS, LinearModel, make_linear_model
 from uavctl.arrays import Array
+from uavctl.cause import CAUSES, TAKEN, Cause
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
@@ -206,7 +207,7 @@ def make_response(history: RecordedFlight, plant: PlantConfig) -> VehicleRespons
 TRUTH = "/sim/truth"
 # As in identification: without setpoints for longer, the vehicle leaves its external mode.
 MAX_PAUSE_NS = 500_000_000
-_END_OF_RECORDING = "the recording ends"
+END_OF_RECORDING = "the recording ends"
 EntryObserver = Callable[[Iterable[Entry]], Iterable[Entry]]
 """Passes on the entries of a recording, for a progress bar."""
 
@@ -217,7 +218,7 @@ class ReflownFlight:
 
     deviation: Deviation  # difference from the recorded flight
     end_ns: int = 0  # last tick in which both flew setpoints [ns]
-    ended: str = _END_OF_RECORDING  # why it ended there
+    ended: str = END_OF_RECORDING  # why it ended there
 
 
 def refly(
@@ -336,13 +337,18 @@ class _ReflownLoop:
             )
         elif self._has_flown_setpoints and self._ended_ns is None:
             self._ended_ns = at_ns
-            course.ended = (
-                "no setpoint of the recording flies the vehicle any more" if new_accel is not None else reason
-            )
+            course.ended = self._explain_end() if new_accel is not None else reason
         if self._ended_ns is None:
-            course.end_ns, course.ended = at_ns, _END_OF_RECORDING
+            course.end_ns, course.ended = at_ns, END_OF_RECORDING
         else:
             self.is_over = at_ns - self._ended_ns > MAX_PAUSE_NS
+
+    def _explain_end(self) -> str:
+        """Return why the recording's setpoints fly the vehicle no more: who took over, if its end tells it."""
+        ending = next(iter(self._history.flight.endings[-1:]), None)
+        if ending is not None and ending.code in TAKEN:
+            return CAUSES[Cause(ending.code)].phrase
+        return "no setpoint of the recording flies the vehicle any more"
 
     def _move_inputs(self, inputs: StepInput) -> StepInput:
         """Return the inputs of the other course: positions by its link, and all measurements moved by δ."""
