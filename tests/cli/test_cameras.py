@@ -55,7 +55,7 @@ def test_each_vehicle_gets_its_own_positions_within_the_budget(
         )
         world.start()
         try:
-            assert run(["cameras", str(fleet_file), "--duration", "3", "--out", str(out), "--json"]) == 0
+            assert run(["cameras", str(fleet_file), "--duration", "3", "--out", str(out.parent), "--json"]) == 0
         finally:
             done.set()
             world.join()
@@ -104,9 +104,9 @@ def test_a_fleet_that_cannot_be_served_is_refused_before_anything_is_opened(
     text = (ROOT / "docs" / "examples" / "radio.toml").read_text()
     assert old in text
     (tmp_path / "fleet.toml").write_text(text.replace(old, new))
-    assert run(["cameras", str(tmp_path / "fleet.toml"), "--out", str(tmp_path / "out.mcap")]) == 2
+    assert run(["cameras", str(tmp_path / "fleet.toml"), "--out", str(tmp_path / "new")]) == 2
     assert expected_text in capsys.readouterr().err
-    assert not (tmp_path / "out.mcap").exists()
+    assert not (tmp_path / "new").exists()
 
 
 def test_ctrl_c_ends_it_with_a_whole_recording(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_ctrl_c_ends_it_with_a_whole_recording(tmp_path: Path) -> None:
         with reserve_port() as reserved:
             text = text.replace(f"0.0.0.0:{old}", f"127.0.0.1:{reserved.getsockname()[1]}")
     (tmp_path / "fleet.toml").write_text(text)
-    command = [sys.executable, "-P", "-m", "uavctl", "cameras", str(tmp_path / "fleet.toml"), "--out", str(out)]
+    command = [sys.executable, "-P", "-m", "uavctl", "cameras", str(tmp_path / "fleet.toml"), "--out", str(out.parent)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
         assert process.stderr is not None and "4 vehicles" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
@@ -128,12 +128,12 @@ def test_ctrl_c_ends_it_with_a_whole_recording(tmp_path: Path) -> None:
 def test_an_older_recording_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sender.mcap"
     out.write_bytes(b"older")
-    assert run(["cameras", str(ROOT / "docs" / "examples" / "radio.toml"), "--out", str(out)]) != 0
+    assert run(["cameras", str(ROOT / "docs" / "examples" / "radio.toml"), "--out", str(out.parent)]) != 0
     assert str(out) in capsys.readouterr().err
     assert out.read_bytes() == b"older"
 
 
 def test_a_fleet_without_a_radio_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     duo = ROOT / "docs" / "examples" / "duo.toml"
-    assert run(["cameras", str(duo), "--out", str(tmp_path / "out.mcap")]) == 2
+    assert run(["cameras", str(duo), "--out", str(tmp_path / "new")]) == 2
     assert "radio: is missing" in capsys.readouterr().err

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 from cyclopts import Parameter
 
+from logs.recording.ends import make_recording_path
 from logs.recording.sender import SenderRecording
 from uavctl.cli.common import SPAN_S, Common, QuietJson
 from uavctl.cli.fleet import Fleet, Member, read_fleet
@@ -34,7 +35,7 @@ def cameras(
     duration: Annotated[
         float | None, Parameter(help="end after this time [s]; else on Ctrl-C", validator=SPAN_S)
     ] = None,
-    out: Annotated[Path, Parameter(help="recording (MCAP): vehicle of each message, and the ages believed")],
+    out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
     json: QuietJson = False,
 ) -> int:
     """Send the positions of all vehicles of a fleet over one channel; never queues. Ctrl-C ends it.
@@ -54,12 +55,13 @@ def cameras(
         start_ns=start_ns,
     )
     names = [member.name for member in fleet.members]
+    path = make_recording_path(out, file.stem).with_name("sender.mcap")
     with (
-        SenderRecording(out, names, read_zero_utc_ns()) as recording,
+        SenderRecording(path, names, read_zero_utc_ns()) as recording,
         _open_connections(fleet) as connections,
         stop_on_signals() as stopped,
     ):
-        print_message(f"sending the positions of {len(names)} vehicles; Ctrl-C ends it")
+        print_message(f"sending the positions of {len(names)} vehicles, recording to {path}; Ctrl-C ends it")
         end_ns = None if duration is None else monotonic_ns() + round(duration * 1e9)
         closed: set[str] = set()
         while not stopped() and (end_ns is None or monotonic_ns() < end_ns):
@@ -73,7 +75,7 @@ def cameras(
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(sender.refused.items()))
         print_message(f"not used: {reasons}")
     counts = {name: sender.sent[number] for number, name in enumerate(names)}
-    document = {"out": str(out), "sent": counts, "refused": dict(sender.refused)}
+    document = {"out": str(path), "sent": counts, "refused": dict(sender.refused)}
     rows = [[name, str(count)] for name, count in counts.items()]
     Common(json=json).show("cameras", document, lambda: make_table("positions sent", ("vehicle", "number"), rows))
     return 0 if all(counts.values()) else 1

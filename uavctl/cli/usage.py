@@ -28,7 +28,7 @@ EXAMPLES = {
     "fleet fly": "uavctl fleet fly duo.toml --arm --takeoff 1.2 --out flights/duo",
     "fleet status": "uavctl fleet status duo.toml",
     "fleet land": "uavctl fleet land duo.toml",
-    "cameras": "uavctl cameras radio.toml --out flights/sender.mcap",
+    "cameras": "uavctl cameras radio.toml",
     "sim": "uavctl sim --config room-px4 --autopilot px4 --view",
     "check": "uavctl check --config my-room.toml --vehicle udpin://0.0.0.0:14540 --move",
     "design": "uavctl design --config room",
