@@ -70,7 +70,7 @@ def identified_before(
     """The flight of the whole run is identified already; another one fails the test."""
     ((flown, identification),) = identified
 
-    def find(history: FlightHistory, *_: Any) -> Identification:
+    def find(history: FlightHistory, *_: Any, **_options: Any) -> Identification:
         assert np.array_equal(history.positions.times_s, flown.positions.times_s)
         assert np.array_equal(history.positions.positions_m, flown.positions.positions_m)
         return identification
