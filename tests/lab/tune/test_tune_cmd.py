@@ -302,7 +302,7 @@ def test_an_incomplete_tuned_configuration_is_not_read(tmp_path: Path) -> None:
 def test_ctrl_c_outside_a_flight_keeps_finished_steps(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def pressed(*_: object) -> None:
+    def pressed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     folder = tmp_path / "copy"
