@@ -61,6 +61,10 @@ class DesignError(UavctlError):
         super().__init__(f"{key}: {reason}; {hint}")
 
 
+class ControllerError(UavctlError):
+    """A controller answers with what is no input."""
+
+
 class ConnectionSpecError(UsageError):
     """A connection URL cannot be understood or opened."""
 

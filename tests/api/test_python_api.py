@@ -18,7 +18,7 @@ from places import ROOT
 
 import uavctl
 from uavctl.cli.app import run
-from uavctl.errors import ConfigError, DesignError, RecordingError, UsageError
+from uavctl.errors import ConfigError, ControllerError, DesignError, RecordingError, UsageError
 from uavctl.records import SolveStatus
 
 PAPER = {"solver.method": "exact"}
@@ -339,10 +339,48 @@ def test_an_error_is_reported_plainly(wrong: Callable[[], object], error: type[E
 
 
 def test_an_infinite_input_is_reported() -> None:
-    from uavctl.errors import UavctlError
-
-    with pytest.raises(UavctlError, match="step 0"):
+    with pytest.raises(ControllerError, match="step 0"):
         uavctl.controller("room", "lqg").step([1e308] * 9)
+
+
+OWN_CONTROLLERS = """
+import numpy as np
+
+class Flat:
+    def __init__(self, problem):
+        self.n_u = problem.plant.n_u
+
+    def begin(self, runs):
+        pass
+
+    def act(self, information):
+        return np.zeros(self.n_u)
+
+class Nan(Flat):
+    def act(self, information):
+        inputs = np.zeros((len(information.newest), self.n_u))
+        inputs[1::2] = np.nan
+        return inputs if len(inputs) > 1 else inputs * np.nan
+"""
+
+
+def test_a_wrong_answer_names_the_controller_and_what_to_give(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "wrong_answers.py").write_text(OWN_CONTROLLERS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for fly, shape in (
+        (lambda kind: uavctl.simulate("room", kind, runs=5, steps=3), (5, 3)),
+        (lambda kind: uavctl.controller("room", kind).step([0.0] * 9), (1, 3)),
+    ):
+        with pytest.raises(ControllerError) as raised:
+            fly("wrong_answers:Flat")
+        assert "wrong_answers:Flat" in str(raised.value)
+        assert f"give {shape}" in str(raised.value)
+    with pytest.raises(ControllerError, match="wrong_answers:Nan"):
+        uavctl.controller("room", "wrong_answers:Nan").step([0.0] * 9)
+    runs = uavctl.simulate("room", "wrong_answers:Nan", runs=5, steps=3)
+    assert runs.failed.tolist() == [False, True, False, True, False]
+    assert [bool(error) for error in runs.errors] == runs.failed.tolist()
+    assert runs.errors[1] in repr(runs) and "wrong_answers:Nan" in runs.errors[1]
 
 
 def test_a_recording_is_not_written_over(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ from uavctl.config import load as load_file
 from uavctl.config.load import format_overrides
 from uavctl.config.mission import MissionConfig
 from uavctl.constraint_names import name_constraints
-from uavctl.errors import ConfigError, UavctlError, UsageError, need
+from uavctl.errors import ConfigError, ControllerError, UsageError, need
 from uavctl.smpc.answer import Answer, Solver
-from uavctl.smpc.batch import BatchController, Information
+from uavctl.smpc.batch import BatchController, Information, ask, name_class
 from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem
@@ -216,7 +216,7 @@ class SteppedController:
 
         Raises:
             UsageError: The first state is missing, not one of this plant, or older than the run.
-            UavctlError: The input of the controller is not finite.
+            ControllerError: The answer of the controller has another shape, or is not finite.
         """
         step, plant = len(self._inputs), self.problem.plant
         if not 0 <= age_steps <= step:
@@ -230,10 +230,11 @@ class SteppedController:
         applied = np.array(self._inputs).reshape(1, step, plant.n_u)
         measurement = Information(step, np.array([self._newest]), self._state[np.newaxis], applied)
         with np.errstate(over="ignore", invalid="ignore"):  # an infinite input is reported below
-            requested = self._controller.act(measurement)[0]
+            requested = ask(self._controller, measurement, plant.n_u)[0]
         if not np.isfinite(requested).all():
-            raise UavctlError(
-                f"the controller asks for {requested} in step {step}; is the state far beyond the limits?"
+            raise ControllerError(
+                f"{name_class(self._controller)} answered {requested} in step {step} to a newest state of "
+                f"{self._state}; an answer is {plant.n_u} finite numbers"
             )
         self._inputs.append(np.clip(requested, *self.problem.input_set.bounds))
         return self._inputs[-1].copy()
@@ -314,6 +315,7 @@ class Runs:
     state_violated: NDArray[np.bool_]  # whether x(1) … x(T) left the limits (N, T)
     input_violated: NDArray[np.bool_]  # whether the input asked for was outside its limits (N, T)
     failed: NDArray[np.bool_]  # whether a run ended in numbers that are not finite (N,)
+    errors: tuple[str, ...]  # why each run failed (N,); empty where it did not
 
     def __repr__(self) -> str:
         """Return two lines: the runs, and their figures."""
@@ -321,7 +323,8 @@ class Runs:
         is_good = ~self.failed
         outside = self.state_violated[is_good].mean() if is_good.any() else 0.0
         cost = f"{self.cost[is_good].sum(axis=1).mean():.6g}" if is_good.any() else "none, all failed"
-        failed = f", {int(self.failed.sum())} failed" if self.failed.any() else ""
+        first_error = next(filter(None, self.errors), "")
+        failed = f", {int(self.failed.sum())} failed: {first_error}" if first_error else ""
         return (
             f"{runs} runs of {steps} steps by {self.controller} on {self.config.name}, seed {self.seed}{failed}\n"
             f"  mean cost {cost}, outside the state limits {outside:.2%} "
@@ -413,6 +416,7 @@ def simulate(
         ConfigError: The configuration is wrong, or not one of campaigns.
         DesignError: There is no such controller.
         UsageError: A number of runs or steps, or a start, that cannot be.
+        ControllerError: The controller answers with another shape. What it raises itself is raised as it is.
         ExtraMissingError: pyarrow is not there.
     """
     need("pyarrow", "campaign")
@@ -429,4 +433,7 @@ def simulate(
 
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _RUN_ARRAYS}
     arrays["age_steps"] = arrays.pop("age")
-    return Runs(loaded, controller, seed, np.arange(steps + 1, dtype=np.float64) * loaded.plant.dt_s, **arrays)
+    errors = tuple(error for part in parts for error in part.errors)
+    return Runs(
+        loaded, controller, seed, np.arange(steps + 1, dtype=np.float64) * loaded.plant.dt_s, errors=errors, **arrays
+    )

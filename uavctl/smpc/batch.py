@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
+from uavctl.errors import RAISED, ControllerError
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import KEPT_TOLERANCE, Answer, Preview, Solver
 from uavctl.smpc.plant import Plant
@@ -54,6 +55,46 @@ class BatchController(Protocol):
         Entries that are not finite end the run as failed.
         """
         ...
+
+
+def ask(controller: BatchController, information: Information, n_u: int) -> Array:
+    """Return the inputs (N, n_u) that a controller answers with; entries may be not finite.
+
+    Raises:
+        ControllerError: The answer has another shape, or is no array of numbers.
+    """
+    answer: object = controller.act(information)
+    shape = (len(information.newest), n_u)
+    try:
+        inputs = to_array(answer)
+    except RAISED as error:  # its own conversion may raise anything
+        raise ControllerError(
+            f"{name_class(controller)} answered with {type(answer).__name__} in step {information.step}, which is no "
+            f"array of numbers; give {shape} (runs, inputs)"
+        ) from error
+    if inputs.shape != shape:
+        raise ControllerError(
+            f"{name_class(controller)} answered with {type(answer).__name__} of shape {inputs.shape} in step "
+            f"{information.step}; give {shape} (runs, inputs)"
+        )
+    return inputs
+
+
+def name_class(controller: object) -> str:
+    """Return `module:Class` of a controller."""
+    return f"{type(controller).__module__}:{type(controller).__qualname__}"
+
+
+def to_array(answer: object) -> Array:
+    """Return an answer as an array.
+
+    Raises:
+        TypeError: It holds no real numbers. Its own conversion may raise anything.
+    """
+    array = np.array(answer)
+    if array.dtype.kind not in "biufO":  # complex numbers and text would be converted silently
+        raise TypeError(array.dtype)
+    return array.astype(np.float64)
 
 
 def predict(plant: Plant, information: Information) -> Array:

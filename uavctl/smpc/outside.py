@@ -22,7 +22,7 @@ from uavctl.arrays import Array
 from uavctl.errors import RAISED, EndedBySignal, in_words
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, are_finite
-from uavctl.smpc.batch import BatchController, Information
+from uavctl.smpc.batch import BatchController, Information, to_array
 from uavctl.smpc.braking import Braking
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.sets import find_equilibria
@@ -93,7 +93,7 @@ class OutsideSolver:
         except RAISED as error:  # a vehicle is in the air
             return self._fail(seq, f"raised {in_words(error, MAX_ERROR_CHARACTERS)}{_locate_error(error)}")
         try:
-            inputs = _to_array(reply)
+            inputs = to_array(reply)
         except RAISED:  # its own conversion may raise anything
             return self._fail(seq, f"answered with {type(reply).__name__}, which is no array of numbers")
         if inputs.shape not in shapes:
@@ -258,13 +258,6 @@ def _read_only(values: Array) -> Array:
     copied = values.copy()
     copied.flags.writeable = False
     return copied
-
-
-def _to_array(reply: object) -> Array:
-    array = np.array(reply)
-    if array.dtype.kind not in "biufO":  # complex numbers and text would be converted silently
-        raise TypeError(array.dtype)
-    return array.astype(np.float64)
 
 
 def _locate_error(error: BaseException) -> str:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from sim.channel import Channel
 from uavctl.arrays import Array
 from uavctl.config import Config, load_config
+from uavctl.errors import ControllerError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.draws import draw
 from uavctl.lab.campaign.world import LinearWorld, simulate
@@ -180,8 +184,63 @@ def test_a_run_with_an_invalid_input_fails_alone() -> None:
     good = simulate(scene(plant, 3), _Linear(plant, gain), known, chances.normal)
     bad = simulate(scene(plant, 3), _Linear(plant, gain, bad=1), known, chances.normal)
     assert bad.failed.tolist() == [False, True, False]
+    assert [error.endswith(":_Linear answered what is not finite in step 3") for error in bad.errors] == [
+        False, True, False,
+    ]  # fmt: skip
     assert np.array_equal(bad.states[[0, 2]], good.states[[0, 2]])
     assert np.isfinite(bad.states).all()
+
+
+class _Answers:
+    """A controller with one answer."""
+
+    def __init__(self, answer: object) -> None:
+        self._answer = answer
+
+    def begin(self, runs: int) -> None: ...
+
+    def act(self, information: Information) -> Any:
+        return self._answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "found"),
+    [
+        (np.zeros(2), "shape (2,)"),
+        (np.zeros((1, 2)), "shape (1, 2)"),
+        (np.zeros((3, 1)), "shape (3, 1)"),
+        (np.zeros((3, 2, 1)), "shape (3, 2, 1)"),
+        (0.0, "shape ()"),
+        (None, "NoneType"),
+        ("left", "str"),
+        ([[0.0, 0.0], [0.0], [0.0, 0.0]], "list"),
+    ],
+)
+def test_an_answer_that_is_no_input_of_every_run_is_refused(answer: object, found: str) -> None:
+    plant = build_plant(config())
+    with pytest.raises(ControllerError) as raised:
+        simulate(scene(plant, 3), _Answers(answer), np.zeros((3, 4), dtype=np.intp), np.zeros((3, 4, plant.n_w)))
+    for part in (__name__.rpartition(".")[2] + ":_Answers", found, "give (3, 2)"):
+        assert part in str(raised.value)
+
+
+def test_a_list_of_numbers_is_an_answer() -> None:
+    plant = build_plant(config())
+    flown = simulate(
+        scene(plant, 2), _Answers([[0, 0.25], [0.125, 0]]), np.zeros((2, 3), dtype=np.intp), np.zeros((2, 3, plant.n_w))
+    )
+    assert flown.inputs[:, -1].tolist() == [[0.0, 0.25], [0.125, 0.0]]
+
+
+def test_a_run_whose_state_overflows_fails_without_an_accusation() -> None:
+    plant = build_plant(config())
+    wild = replace(plant, a=1e300 * np.eye(plant.n_x))
+    with np.errstate(over="ignore", invalid="ignore"):
+        flown = simulate(
+            scene(wild, 2), _Answers(np.zeros((2, 2))), np.zeros((2, 4), dtype=np.intp), np.zeros((2, 4, plant.n_w))
+        )
+    assert flown.failed.all()
+    assert set(flown.errors) == {"ended in numbers that are not finite"}
 
 
 class _Numbered:

@@ -162,9 +162,7 @@ def make_chunk(states: Array, ages: NDArray[np.intp]) -> Chunk:
     runs, steps = ages.shape
     flat, flags = np.zeros((runs, steps, 2)), np.zeros((runs, steps), dtype=bool)
     flags[0, 1:] = True
-    flown = Trajectories(
-        states, flat, flat, ages, np.ones((runs, steps)), flags, flags.copy(), np.zeros(runs, dtype=bool)
-    )
+    flown = Trajectories(states, flat, flat, ages, np.ones((runs, steps)), flags, flags.copy(), ("",) * runs)
     return Chunk(flown, decisions=3, infeasible=0, slack_used=1, missed=2, fallbacks=0, largest_gap=0.5)
 
 

@@ -270,9 +270,8 @@ def _compute_figures(task: Task, first: int, runs: int) -> Columns:
     trajectories, tally = fly_task(task, first, runs)
     steps = trajectories.age.shape[1]
     columns = _make_empty_columns(task, first, runs, "")
-    is_finite = np.isfinite(trajectories.states).all(axis=(1, 2)) & np.isfinite(trajectories.cost).all(axis=1)
-    is_complete = is_finite & ~trajectories.failed
-    columns["error"][~is_complete] = "ended in numbers that are not finite"
+    is_complete = ~trajectories.failed
+    columns["error"][:] = trajectories.errors
     with np.errstate(over="ignore", invalid="ignore"):
         figures = {
             "cost": trajectories.cost.sum(axis=1),
