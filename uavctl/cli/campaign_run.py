@@ -26,7 +26,7 @@ from uavctl.lab.campaign.page import write_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
 from uavctl.lab.campaign.results import SCHEMA, CampaignRecord, CellSummary
 from uavctl.lab.campaign.spec import read_campaign
-from uavctl.lab.campaign.store import Store
+from uavctl.lab.campaign.store import Store, find_first_error
 from uavctl.lab.campaign.tasks import make_cells, make_document, make_tasks
 from uavctl.lab.campaign.trial_page import write_trial_report
 from uavctl.lab.campaign.trials import SCHEMA as TRIAL_SCHEMA
@@ -129,6 +129,8 @@ def fly_campaign(
         name=campaign.name, runs_file=str(store.table), report=str(report), wall_s=wall_s, cells=cells
     )
     Common(json=json).show("campaign", result, lambda: campaign.render(result))
+    if first_error := find_first_error(store.table):
+        print_message(f"the first failed run, {first_error}")
     return 0 if any(cell.runs > cell.failed for cell in cells) else 1
 
 
@@ -226,7 +228,8 @@ def _render_runs(result: CampaignResult[CellSummary]) -> RenderableType:
         table.add_row(*names, str(cell.runs), str(cell.failed), *figures, str(cell.fallbacks), str(cell.max_age))
     refused = [f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused]
     note = (
-        "Out: beyond a limit of the state, with its interval at 95 %. Failed runs are in no figure but in runs.parquet."
+        "Out: beyond a limit of the state, with its interval at 95 %. No figure counts failed runs; runs.parquet lists "
+        "them."
     )
     return Group(table, *_format_closing(result, refused, [note]))
 

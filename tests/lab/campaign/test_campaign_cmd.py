@@ -21,6 +21,21 @@ from uavctl.cli.app import run
 from uavctl.lab.campaign.spec import CHUNK
 
 LIMIT_S = 120.0
+RAISING = """
+import numpy as np
+
+class Raising:
+    def __init__(self, problem):
+        self.n_u = problem.plant.n_u
+
+    def begin(self, runs):
+        self.runs = runs
+
+    def act(self, information):
+        if information.step:
+            raise KeyError(f"gain of step {information.step}")
+        return np.zeros((self.runs, self.n_u))
+"""
 RUNS = CHUNK + 3  # two tasks a cell
 SPEC = (
     HEAD
@@ -191,6 +206,19 @@ def test_fewer_runs_and_a_table_for_people(
     rows = pq.read_table(folder / "runs.parquet").to_pylist()
     assert len(rows) == 24 and {bool(row["error"]) for row in rows if row["cell"] == 0} == {False}
     assert {row["error"] for row in rows if row["cell"] == 1} == {"ended in numbers that are not finite"}
+
+
+def test_the_first_reason_of_failed_runs_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "raising_controllers.py").write_text(RAISING)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "c.toml").write_text(
+        HEAD + "steps = 3\nruns = 3\n" + controller("lqg") + '[[controller]]\nname = "own"\n'
+        'kind = "raising_controllers:Raising"\n'
+    )
+    assert run(["campaign", str(tmp_path / "c.toml"), "--workers", "1", "--out", str(tmp_path / "out")]) == 0
+    assert "own: KeyError: 'gain of step 1'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_campaign_without_flown_cells_ends_with_exit_code_1(

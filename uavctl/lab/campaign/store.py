@@ -156,6 +156,16 @@ def find_first_difference(stored: object, current: object) -> str | None:
     )
 
 
+def find_first_error(table: Path) -> str:
+    """Return controller and reason of the first failed run in a table of runs; empty without one."""
+    for file in sorted(table.glob("*.parquet")):
+        rows = pq.read_table(file, columns=["controller", "error"])
+        for controller, error in zip(rows["controller"].to_pylist(), rows["error"].to_pylist(), strict=True):
+            if error:
+                return f"{controller}: {error}"
+    return ""
+
+
 def _shorten(value: object) -> str:
     text = msgspec.json.encode(value).decode()
     return text if len(text) <= 60 else f"{text[:59]}…"
