@@ -26,7 +26,7 @@ _BAR_AFTER_S = 2.0  # what ends sooner needs no bar
 
 
 def compute_flight_risk(config: Config, seed: int = 0, design: ConditionedDesign | None = None) -> FlightRisk | None:
-    """Rehearse the flights; None for none, for the paper's scheme, and for a controller of another package.
+    """Rehearse the flights; None for none, the paper's scheme, a plant without axes, and an outside controller.
 
     Args:
         seed: Seed of the rehearsed flights.
@@ -36,6 +36,8 @@ def compute_flight_risk(config: Config, seed: int = 0, design: ConditionedDesign
         DesignError: The configuration has no controller, or its mission cannot be flown.
     """
     if not config.is_age_conditioned or config.smpc.controller or not config.check.rehearsals:
+        return None
+    if not config.plant.axes:
         return None
     design = build_conditioned(config) if design is None else design
     progress, begin_s = make_progress(), time.monotonic()

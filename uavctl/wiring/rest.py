@@ -24,7 +24,7 @@ def check_axes(config: Config) -> None:
             "plant.axes",
             "is missing: a flight and its simulated vehicle, a cascade and a filter of positions have to know which "
             "states are positions and velocities",
-            "add it with position_index, velocity_index and accel_per_input; `uavctl solve`, `campaign` and "
+            "add it with position_index, velocity_index and accel_per_input; `uavctl solve`, `design`, `campaign` and "
             "uavctl.simulate go without",
         )
 

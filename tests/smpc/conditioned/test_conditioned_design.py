@@ -55,6 +55,22 @@ def quick(folder: Path) -> str:
     return str(file)
 
 
+def test_a_plant_without_axes_has_a_design(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.toml").write_text(
+        "[plant]\na = [[1, 0.1], [0, 1]]\nb = [[0.005], [0.1]]\ne = [[0.005], [0.1]]\ndt_s = 0.1\n"
+        "[sets]\nstate_lower = [-5, -2]\nstate_upper = [5, 2]\ninput_lower = [-1]\ninput_upper = [1]\n"
+        "[cost]\nstate = [1, 0.1]\ninput = [0.1]\n[link]\nloss = 0.3\n"
+    )
+    assert main(["design", "--config", str(tmp_path / "own.toml"), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    # P(age = i) = (1 - p) p^i with independent losses
+    assert figures["weights"][:4] == pytest.approx([0.7 * 0.3**i for i in range(4)])
+    assert figures["rehearsal"] is None
+    assert figures["flight_risk"] is None
+    assert main(["design", "--config", str(tmp_path / "own.toml")]) == 0
+    assert "upper limit of state 0" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("_no_other_design", "no_page")
 def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
