@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 import uavctl
 
@@ -31,6 +32,23 @@ def test_printed_objects_are_a_few_lines(tmp_path: Path) -> None:
         assert len(repr(value)) < 500
     assert plan.status.value in repr(plan)
     assert f"{plan.inputs[0, 0]:.4g} m/s²" in repr(plan)
+
+
+@pytest.mark.parametrize(
+    "link",
+    [
+        {"loss": 0.25},
+        {"probability": [1.0, 0.9, 0.7]},
+        {"model": "gilbert-elliott", "loss": 0.0, "burst_enter": 0.2, "burst_leave": 0.5},
+        {"model": "gilbert-elliott", "loss": 0.1, "burst_enter": 0.05, "burst_leave": 0.3, "burst_loss": 0.8},
+        {"model": "empirical", "gaps": [0.6, 0.25, 0.05, 0.1]},
+        {"model": "trace", "trace_s": [0.0, float("inf"), 0.0, float("inf"), float("inf")]},
+    ],
+)
+def test_a_configuration_s_text_has_the_loss_of_the_link_in_the_long_run(link: dict[str, object]) -> None:
+    config = uavctl.load("paper", {"link.loss": 0.0, **{f"link.{key}": value for key, value in link.items()}})
+    # With one packet a step and no delay, a position is a step old where its packet is lost.
+    assert f"mean loss {uavctl.link(config).outage(1):.3g}" in repr(config)
 
 
 def test_a_plan_is_drawn_with_units_and_limits() -> None:

@@ -101,6 +101,21 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     held: Annotated[Spans, declare("spans that hold packets to their end", "s", length=MAX_SPANS)] = ()
     uplink_blackout: Annotated[Spans, declare("spans in which nothing reaches the vehicle", "s", length=MAX_SPANS)] = ()
 
+    @property
+    def mean_loss(self) -> float:
+        """Share of packets that are lost in the long run, without delays and spans."""
+        if self.model == "gilbert-elliott":
+            # π_bad = enter / (enter + leave)
+            bad = self.burst_enter / (self.burst_enter + self.burst_leave)
+            return (1.0 - bad) * self.loss + bad * self.burst_loss
+        if self.model == "empirical":
+            # n̄ / (n̄ + 1), with the mean n̄ of the losses after one that arrived
+            lost = sum(i * probability for i, probability in enumerate(self.gaps)) / sum(self.gaps)
+            return lost / (lost + 1.0)
+        if self.model == "trace":
+            return sum(math.isinf(delay_s) for delay_s in self.trace_s) / len(self.trace_s)
+        return 1.0 - self.probability[-1] if self.probability else self.loss
+
 
 _COLUMN = "delay_s"
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

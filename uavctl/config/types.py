@@ -400,7 +400,7 @@ class Config(Section, frozen=True, kw_only=True):
         return (
             f"configuration {self.name}: plant {plant.model}{f' ({axes})' if axes else ''}, Δt {plant.dt_s:g} s, "
             f"{self.smpc.controller or self.smpc.scheme} with horizon {self.smpc.horizon}, "
-            f"link {self.link.model} with loss {self.link.loss:g}"
+            f"link {self.link.model} with mean loss {self.link.mean_loss:.3g}"
         )
 
     @property
