@@ -43,6 +43,7 @@ from uavctl.cli.flying import (
     record_failure,
 )
 from uavctl.cli.live_line import show_live_line
+from uavctl.cli.output import warn
 from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
@@ -51,6 +52,7 @@ from uavctl.daemon.daemon import fly
 from uavctl.daemon.flight_orders import FlightOrders, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.realtime import control_garbage_collection
 from uavctl.errors import UavctlError, UsageError
+from uavctl.flight.monitors.external import MAX_ANSWER_NS
 from uavctl.io.signed_connection import open_links
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
 from uavctl.loop import ControlLoop
@@ -157,7 +159,21 @@ def fly_lockstep(prepared: Prepared, path: Path, orders: FlightOrders) -> Flight
     finally:
         status = flight.close()
         print_ending(describe_ending(flight.loop.ending, status))
-    return conclude_flight(path, flight.wall_s, status, flight.loop.ending)
+    summary = conclude_flight(path, flight.wall_s, status, flight.loop.ending)
+    if config.smpc.controller:
+        _warn_of_slow_answers(config, summary)
+    return summary
+
+
+def _warn_of_slow_answers(config: Config, summary: FlightSummary) -> None:
+    """Warn of a controller that a flight in real time would not ask again."""
+    median_us, largest_us = summary.decision_us.p50 or 0.0, summary.decision_us.max or 0.0
+    if median_us <= config.daemon.tick_s * 1e6 and largest_us <= MAX_ANSWER_NS * 1e-3:
+        return
+    warn(
+        f"{config.smpc.controller} took {median_us * 1e-3:.0f} ms (median; largest {largest_us * 1e-3:.0f} ms) in "
+        f"virtual time; a flight in real time would end on it: a tick lasts {config.daemon.tick_s * 1e3:g} ms"
+    )
 
 
 def _fly_real_time(prepared: Prepared, path: Path, orders: FlightOrders, viewers: DerivedTopics) -> FlightSummary:
