@@ -314,10 +314,12 @@ FILE = "nothing-here.toml"
         (lambda: uavctl.simulate("room", "smcp"), DesignError, 'nearest valid name "smpc"'),
         (lambda: uavctl.simulate("room", runs=0), UsageError, "runs"),
         (lambda: uavctl.simulate("room", steps=1), UsageError, "steps"),
+        (lambda: uavctl.simulate("room", seed=-1), UsageError, "at `seed`"),
         (lambda: uavctl.simulate("room", start=[0.0]), UsageError, "give 9 finite numbers"),
         (lambda: uavctl.simulate(uavctl.load("room", {"sim.plant": "quadrotor"})), ConfigError, "sim.plant"),
         (lambda: uavctl.controller("room").step(None), UsageError, "first step"),
         (lambda: uavctl.controller("room").step([0.0] * 9, 1), UsageError, "cannot be 1 steps old"),
+        (lambda: uavctl.controller("room").step([0.0] * 9, 0.5), UsageError, "whole number"),  # type: ignore[arg-type]
         (lambda: uavctl.controller("room", "pid-loop"), DesignError, "pid"),
         (lambda: uavctl.fly("room", duration_s=1e-3), UsageError, "shorter than a tick"),
         (lambda: uavctl.fly("room", seed=-1), ConfigError, "sim.seed"),

@@ -219,8 +219,10 @@ class SteppedController:
             ControllerError: The answer of the controller has another shape, or is not finite.
         """
         step, plant = len(self._inputs), self.problem.plant
-        if not 0 <= age_steps <= step:
-            raise UsageError(f"a packet of step {step} cannot be {age_steps} steps old; give 0 to {step}")
+        if not isinstance(age_steps, int | np.integer) or not 0 <= age_steps <= step:
+            raise UsageError(
+                f"a packet of step {step} cannot be {age_steps} steps old; give a whole number, 0 to {step}"
+            )
         if state is not None:
             reported_state = make_state(state, plant)
             if step - age_steps > self._newest:
@@ -278,7 +280,8 @@ def make_cell(config: Config, kind: str, **spec: object) -> tuple[Recipe, CellSe
     try:
         campaign = msgspec.convert(document, CampaignSpec)
     except msgspec.ValidationError as error:
-        raise UsageError(f"{error}; docs/campaign-keys.md lists the keys") from error
+        text = str(error).replace("$.master", "seed").replace("$.", "")
+        raise UsageError(f"{text}; docs/campaign-keys.md lists the keys") from error
     problems = tuple(
         f"{problem.key}: {problem.reason}; load it with {problem.todo}"
         for problem in find_plant_problems(config, (), "config")

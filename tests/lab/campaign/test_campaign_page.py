@@ -152,6 +152,21 @@ def test_the_promise_is_judged_by_the_measured_rates(
     assert find_numbers(first) == [*cells, rate, 5.0]
 
 
+@pytest.mark.parametrize(
+    ("states", "inputs", "named"),
+    [(1, 1, ["states", "requested inputs"]), (1, 0, ["states"]), (0, 1, ["requested inputs"])],
+)
+def test_states_and_requests_that_are_outside_more_often_are_told_apart(
+    states: int, inputs: int, named: list[str], tmp_path: Path
+) -> None:
+    cheaper = runs(1, (SMPC * 0.97).tolist(), state_violations=outside(states), input_violations=outside(inputs))
+    verdict = judged(tmp_path, cheaper)
+    _, limits = describe_briefly(verdict.comparisons[0]).split(", ")
+    assert limits.partition(" outside")[0].split(" and ") == named
+    claim = describe_verdict(verdict)[0].partition(":")[0]
+    assert [noun for noun in ("states", "requested inputs") if noun in claim] == named
+
+
 def test_a_better_baseline_is_reported(tmp_path: Path) -> None:
     verdict = judged(tmp_path, runs(1, (SMPC * 0.5).tolist()))
     assert (verdict.is_unmatched, verdict.is_beaten, get_verdict_word(verdict)) == (False, True, "no")

@@ -107,8 +107,8 @@ def _describe_verdicts(judged: Sequence[CampaignVerdict]) -> str:
     better = sum(v.is_better_than_all for v in judged)
     text = (
         f"In {unmatched} of {count(len(judged), 'case')} no baseline is as cheap as the SMPC at equal or lower "
-        f"violation rates; in {better} of these each one costs more and keeps limits no better. In {beaten_count} a "
-        "baseline costs less and breaks limits no more often."
+        f"violation rates; in {better} of these each one costs more and keeps limits no better. A "
+        f"baseline costs less, and breaks limits no more often, in {beaten_count}."
     )
     undecided = len(judged) - unmatched - beaten_count
     return (

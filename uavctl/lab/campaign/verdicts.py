@@ -128,7 +128,7 @@ def describe_briefly(comparison: BaselineComparison) -> str:
     if not comparison.is_as_safe:
         limits = ", keeps limits better"
     elif comparison.is_safer:
-        limits = ", breaks limits more often"
+        limits = f", {_name_broken(comparison)} outside more often"
     return (
         _describe_extra_cost(comparison, "costs ", interval=False) if comparison.cost_sign else "costs the same"
     ) + limits
@@ -165,10 +165,16 @@ def _describe_comparison(comparison: BaselineComparison) -> str:
     if not comparison.is_as_safe:
         limits_text = ", but keeps limits better" if comparison.cost_sign < 0 else " and keeps limits better"
     elif comparison.is_safer:
-        limits_text = ", but breaks limits more often"
+        limits_text = f", but {_name_broken(comparison)} are outside more often"
     else:
         limits_text = " and breaks limits no more often"
     return f"{name} {costs}{limits_text}: {_describe_limits(comparison)}.{_describe_allowance(comparison)}"
+
+
+def _name_broken(comparison: BaselineComparison) -> str:
+    """Return what is outside significantly more often with the baseline: states, requested inputs, or both."""
+    differences = (("states", comparison.state), ("requested inputs", comparison.inputs))
+    return " and ".join(noun for noun, difference in differences if difference is not None and difference.sign < 0)
 
 
 def _describe_allowance(comparison: BaselineComparison) -> str:
@@ -207,7 +213,7 @@ def _describe_limits(comparison: BaselineComparison) -> str:
     smpc, baseline = comparison.smpc, comparison.baseline
     parts = (
         ("states", smpc.violation_rate, baseline.violation_rate),
-        ("inputs", smpc.input_violation_rate, baseline.input_violation_rate),
+        ("requested inputs", smpc.input_violation_rate, baseline.input_violation_rate),
     )
     shares = ", ".join(
         f"{noun} in {format_percent(baseline_rate)} of steps (SMPC {format_percent(smpc_rate)})"
