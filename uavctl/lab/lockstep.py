@@ -52,7 +52,7 @@ class _VirtualTimeLoop:
         lands: whether a finished loop is left alone, while others still fly.
     """
 
-    def __init__(self, loop: ControlLoop, observer: TickObserver | None, *, lands: bool) -> None:
+    def __init__(self, loop: ControlLoop, observer: TickObserver | None, *, lands: bool = False) -> None:
         self._loop = loop
         self._observer = observer
         self._lands = lands
