@@ -86,6 +86,7 @@ def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.Capture
         (HEAD + make_entry("a", WEST, A) + make_entry("b", (-1.0, 2.5), B), ("overlap by 0.60 m",)),
         (HEAD + make_entry("a", WEST, A) + make_entry("a", EAST, B), ("two vehicles are named a",)),
         (HEAD + make_entry("a", WEST, A) + make_entry("b", EAST, A), ("one link", A)),
+        (HEAD + make_entry("a", WEST, A, A) + make_entry("b", EAST, B, A), ("a and b have the same mocap", A)),
         (HEAD, ("vehicle",)),
         (make_entry("a", WEST, A), ("spacing_m",)),
         ("spacing_m = 0\n" + make_entry("a", WEST, A), ("spacing_m",)),

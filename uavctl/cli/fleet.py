@@ -177,6 +177,9 @@ def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[Conf
         if first.config.daemon.vehicle == second.config.daemon.vehicle:
             reason = f"{first.name} and {second.name} have one link, {first.config.daemon.vehicle}"
             yield ConfigProblem(key, reason, "give each a `vehicle` of its own")
+        elif (mocap := first.config.daemon.mocap) == second.config.daemon.mocap and not mocap.endswith(":0"):
+            reason = f"{first.name} and {second.name} have the same mocap, {mocap}"
+            yield ConfigProblem(key, reason, "give each a `mocap` of its own")
         elif first.daemon == second.daemon:
             reason = f"the daemons of {first.name} and {second.name} would both be named {first.daemon}"
             yield ConfigProblem(key, reason, "give their configurations names that differ early")
