@@ -71,6 +71,7 @@ class Cause(StrEnum):
     NOT_REACHED = "not-reached"
     OFF_TRACK = "off-track"
     WIND = "wind"
+    COMPUTER_SLOW = "computer-slow"
     VEHICLE_WARNED = "vehicle-warned"
     SECOND_VEHICLE = "second-vehicle"
     PLANS_RELAXED = "plans-relaxed"
@@ -188,6 +189,7 @@ CAUSES: dict[Cause, CauseText] = {
     _C.NOT_REACHED: CauseText(_R.QUALITY, CAUTION, "Place not reached", "the place was not reached"),
     _C.OFF_TRACK: CauseText(_R.QUALITY, CAUTION, "Far from the target"),
     _C.WIND: CauseText(_R.QUALITY, CAUTION, "Strong push"),
+    _C.COMPUTER_SLOW: CauseText(_R.QUALITY, CAUTION, "Computer too slow"),
     _C.VEHICLE_WARNED: CauseText(_R.QUALITY, CAUTION, "The vehicle warned"),
     _C.SECOND_VEHICLE: CauseText(_R.QUALITY, CAUTION, "Second vehicle", "another vehicle was heard"),
     _C.PLANS_RELAXED: CauseText(_R.DETAIL, CAUTION, "Plans relaxed"),

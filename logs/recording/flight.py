@@ -188,7 +188,7 @@ class FlightData:
     @property
     def part(self) -> bool:
         """Whether the recording lacks the first ticks of its flight, as a later file does."""
-        return bool(self.decisions[0].tick)
+        return self.decisions[0].tick > self.decisions[0].missed_ticks
 
     @property
     def breaks_off(self) -> bool:

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from logs.recording.flight import FLOWN
+from logs.recording.missed_ticks import describe_missed_ticks
 from logs.recording.notes import NoteKind
 from logs.report.evidence import MIN_STALL_S, FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion
@@ -117,6 +118,14 @@ def find_process_pause(e: FlightEvidence) -> Iterator[Finding]:
             "setpoints"
         )
         yield Finding(Cause.STOOD_STILL, at_s, text)
+
+
+def find_missed_ticks(e: FlightEvidence) -> Iterator[Finding]:
+    """Find a computer that was too slow: too many ticks missed."""
+    text = describe_missed_ticks(e.flight.decisions)
+    if text:
+        first = next(decision for decision in e.flight.decisions if decision.missed_ticks)
+        yield Finding(Cause.COMPUTER_SLOW, e.to_seconds(first.at_ns), text)
 
 
 def find_recording_cut(e: FlightEvidence) -> Iterator[Finding]:

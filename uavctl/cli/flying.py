@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from logs.recording.ends import count_missing_records, describe_ending, find_missing_files
 from logs.recording.flight import FlightData
+from logs.recording.missed_ticks import describe_missed_ticks
 from logs.recording.reader import read
 from logs.recording.recorder import DerivedTopics, RecorderStatus
 from logs.recording.summary import FlightSummary, summarise
@@ -158,6 +159,9 @@ def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: E
     print_losses(status)
     with stop_on_signals():
         flight = FlightData.from_records(read(path), path)
+        slowness = describe_missed_ticks(flight.decisions)
+        if slowness:
+            print_message(label_text("warning", f"this computer was too slow: {slowness}", "bold yellow"))
         page = path.with_suffix(".html")
         summary = summarise(
             flight,

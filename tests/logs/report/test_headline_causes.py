@@ -230,6 +230,26 @@ def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: boo
     assert Cause.VEHICLE_SILENT not in head(dataclasses.replace(plain, vehicles=off)).causes
 
 
+@pytest.mark.parametrize(("missed", "is_slow"), [(0.0, False), (0.005, False), (0.03, True)])
+def test_a_computer_that_misses_ticks_is_named(good: FlightData, missed: float, is_slow: bool) -> None:
+    """Every so-many-th tick comes one period late; the share of the ticks missed decides."""
+    period = round(1.0 / missed) if missed else len(good.decisions) + 1
+    decisions = tuple(
+        msgspec.structs.replace(decision, missed_ticks=1) if number % period == period - 1 else decision
+        for number, decision in enumerate(good.decisions)
+        if number % period != period - 2
+    )
+    assert (Cause.COMPUTER_SLOW in head(dataclasses.replace(good, decisions=decisions)).causes) == is_slow
+
+
+@pytest.mark.parametrize("tick", [1, 3])
+def test_a_flight_whose_first_ticks_were_missed_is_whole(good: FlightData, tick: int) -> None:
+    first = msgspec.structs.replace(good.decisions[tick], missed_ticks=tick)
+    assert first.tick == tick
+    assert not dataclasses.replace(good, decisions=(first, *good.decisions[tick + 1 :])).part
+    assert dataclasses.replace(good, decisions=good.decisions[tick:]).part
+
+
 @pytest.mark.parametrize(
     ("code", "cause"),
     [
