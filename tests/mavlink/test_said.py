@@ -6,11 +6,11 @@ import pytest
 from loopback_rig import MemorySink, make_loop
 from mavlink_rig import Peer, events, make_link, packets
 
-from uavctl.cli.live_line import REPEAT_NS, MessageFilter, describe_wait
+from uavctl.cli.live_line import REPEAT_NS, MessageFilter, describe_phase, describe_wait
 from uavctl.config import load_config
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.statustext import CHUNK_WAIT_NS, MAX_PARTIAL_TEXTS, MISSING_CHUNK
-from uavctl.records import Event, Severity
+from uavctl.records import ControlMode, Event, Severity
 
 SECOND = 1_000_000_000
 NOT_NEUTRAL = "Arm: Throttle (RC3) is not neutral"
@@ -35,6 +35,21 @@ def test_it_is_said_in_the_vehicle_s_words_with_what_is_waited_for() -> None:
     assert line is not None and NOT_NEUTRAL in line and describe_wait(HandoverState.ARMING) in line
     flying = MessageFilter().format_line(words(0), HandoverState.ENGAGED)
     assert flying is not None and "waiting" not in flying
+
+
+@pytest.mark.parametrize(
+    ("mode", "state", "word"),
+    [
+        (ControlMode.WAIT, HandoverState.CLIMBING, "climb"),
+        (ControlMode.WAIT, HandoverState.WAITING, "wait"),
+        (ControlMode.STOPPED, HandoverState.LANDING, "landing"),
+        (ControlMode.STOPPED, HandoverState.SETTLING, "landing"),
+        (ControlMode.STOPPED, HandoverState.DONE, "stopped"),
+        (ControlMode.TRACK, HandoverState.ENGAGED, "track"),
+    ],
+)
+def test_the_vehicle_s_own_climb_and_landing_are_named(mode: ControlMode, state: HandoverState, word: str) -> None:
+    assert describe_phase(mode, state) == word
 
 
 def test_different_words_are_each_said_and_what_is_no_refusal_is_not() -> None:

@@ -168,6 +168,16 @@ class _StateColumn(ProgressColumn):
         return line if isinstance(line, Text) else Text(task.description)
 
 
+_LANDING = (HandoverState.LANDING, HandoverState.SETTLING)
+
+
+def describe_phase(mode: ControlMode, state: HandoverState) -> str:
+    """Return the word for the phase of a flight: the controller's mode, or the vehicle's own climb or landing."""
+    if mode is ControlMode.WAIT and state is HandoverState.CLIMBING:
+        return "climb"
+    return "landing" if mode is ControlMode.STOPPED and state in _LANDING else mode.value
+
+
 def _format_state(ticked: Ticked, handover_state: HandoverState) -> Text:
     decision, vehicle, estimate = ticked.decision, ticked.vehicle, ticked.estimate
     mode = "no vehicle" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
@@ -175,7 +185,9 @@ def _format_state(ticked: Ticked, handover_state: HandoverState) -> Text:
     accel = "-" if decision.input is None else " ".join(f"{u:+z.2f}" for u in decision.input)
     awaited = describe_wait(handover_state) if decision.mode is ControlMode.WAIT else ""
     mode = f"{mode}, waiting for {awaited}" if awaited else mode
-    return Text.assemble(f"{decision.mode.value:7} age {age:>6}  input {accel}  ", (mode, "dim"))
+    return Text.assemble(
+        f"{describe_phase(decision.mode, handover_state):7} age {age:>6}  input {accel}  ", (mode, "dim")
+    )
 
 
 def _format_recorder_warning(status: RecorderStatus) -> Text:
