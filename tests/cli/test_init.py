@@ -98,13 +98,30 @@ def test_limits_as_lists_beside_a_room_are_refused_with_both_lines() -> None:
     assert f"line {lines.index('[room]') + 1} " in problem
 
 
+def test_a_target_outside_the_room_is_told_by_the_key_and_the_place_that_gave_it() -> None:
+    text = write_room("px4")
+    for overrides, place in (
+        (["room.target_north_m=30"], "--set room.target_north_m=30: room.target_north_m: "),
+        (["target.position_m=[30,0,-1]"], "--set target.position_m=[30,0,-1]: target.position_m[0]: "),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            parse(text, "mine.toml", overrides)
+        (problem,) = refused.value.problems
+        assert problem.startswith(place) and "room.north_m" in problem
+
+
+def test_a_delay_in_milliseconds_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"clock\.latency_s"):
+        parse(write_room("px4"), "mine.toml", ["clock.latency_s=16"])
+
+
 @pytest.mark.parametrize(
     ("old", "new", "key"),
     [
         ("north_m = [-2.5, 2.5]", "north_m = [2.5, -2.5]", "room.north_m"),
         ("speed_mps = 1.5", "speed_mps = -1.5", "room.speed_mps"),
         ("speed_mps = 1.5", "sped_mps = 1.5", "room.sped_mps"),
-        ("target_north_m = 0.0", "target_north_m = 4.0", "target.position_m[0]"),
+        ("target_north_m = 0.0", "target_north_m = 4.0", "room.target_north_m"),
     ],
 )
 def test_what_is_wrong_in_a_room_is_named_with_its_line(old: str, new: str, key: str) -> None:

@@ -48,6 +48,9 @@ def get_position_limits_m(config: Config) -> dict[str, tuple[float, float]]:
     return {axis: (sets.state_lower[i], sets.state_upper[i]) for axis, i in zip(plant.axes, indices, strict=True)}
 
 
+_ROOM_KEYS = {"north": "room.north_m", "east": "room.east_m", "down": "room.height_m"}
+
+
 def find_outside(
     plant: PlantConfig, sets: SetsConfig, position_m: Position, key: str, name: str
 ) -> Iterator[ConfigProblem]:
@@ -62,7 +65,8 @@ def find_outside(
                 f"{key}[{_AXES.index(axis)}]",
                 f"{axis} {value:g} m is outside the admissible box [{low:g}, {high:g}]",
                 suggest_height_sign(axis, value, low, high)
-                or f"move the {name} inside, or widen sets.state_lower and sets.state_upper",
+                or f"move the {name} inside, or widen {_ROOM_KEYS[axis]} (without [room]: sets.state_lower and "
+                "sets.state_upper)",
             )
 
 

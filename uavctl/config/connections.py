@@ -13,6 +13,8 @@ from msgspec import Meta
 
 from uavctl.config.document import MAX_PATH_LENGTH, MAX_URL_LENGTH, ConfigProblem, Position, Section, declare
 
+MAX_LATENCY_S = 2.0  # no camera system is slower; 3 ms in milliseconds is above it
+
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
     """Requests to the vehicle (docs/hand-over.md); only `--arm --takeoff` arms."""
@@ -119,7 +121,9 @@ class SourceConfig(Section, frozen=True, kw_only=True):
 class ClockConfig(Section, frozen=True, kw_only=True):
     """Clock of the source (docs/check.md)."""
 
-    latency_s: Annotated[float, declare("least delay of a position, for a peer without TIMESYNC", "s", 0, 60)] = 0.0
+    latency_s: Annotated[
+        float, declare("least delay of a position, for a peer without TIMESYNC", "s", 0, MAX_LATENCY_S)
+    ] = 0.0
     window_s: Annotated[float, declare("window of the sliding minimum of (received − stamp)", "s", 0.001, 600)] = 10.0
     future_tolerance_s: Annotated[float, declare("a stamp further in the future is refused", "s", 0, 60)] = 0.02
 

@@ -337,6 +337,7 @@ class Source:
     base_places: Mapping[str, str] = field(
         default_factory=dict
     )  # key path -> place in the base, for keys that the file lacks
+    room_keys: Mapping[str, str] = field(default_factory=dict)  # key path -> key of [room] that has written it
 
     def locate(self, key: str) -> str:
         """The place in another file, the override that set `key`, or `file:line` of it or the nearest table around."""
@@ -345,9 +346,9 @@ class Source:
         )
         if enclosing:
             return self.file_places[enclosing]
-        for path, text in reversed(self.overrides):
-            if key == path or key.startswith((f"{path}.", f"{path}[")) or path.startswith(f"{key}."):
-                return f"--set {text}"
+        override = self._find_override(key) or self._find_override(self.room_keys.get(key, ""))
+        if override:
+            return f"--set {override}"
         for enclosing_key in _iterate_enclosing(key):
             if enclosing_key in self.lines:
                 return f"{self.file}:{self.lines[enclosing_key]}"
@@ -356,8 +357,16 @@ class Source:
         return f"{self.file}:1"
 
     def describe(self, problem: ConfigProblem) -> str:
-        """One line: place, key, error, remedy."""
-        return f"{self.locate(problem.key)}: {problem.key}: {problem.reason}; {problem.todo}"
+        """One line: place, key as it was given, error, remedy."""
+        key = problem.key if self._find_override(problem.key) else self.room_keys.get(problem.key, problem.key)
+        return f"{self.locate(problem.key)}: {key}: {problem.reason}; {problem.todo}"
+
+    def _find_override(self, key: str) -> str:
+        """Return the text of the last override that set `key`, or a part of it; empty without one."""
+        for path, text in reversed(self.overrides):
+            if key == path or key.startswith((f"{path}.", f"{path}[")) or (key and path.startswith(f"{key}.")):
+                return text
+        return ""
 
 
 def _iterate_enclosing(key: str) -> Iterator[str]:

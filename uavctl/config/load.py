@@ -207,10 +207,12 @@ def _parse(table: dict[str, Any], text: str, file: str, overrides: Sequence[str]
     problems: list[ConfigProblem] = list(find_oversized(table))
     lines = find_key_lines(text)
     base_places: dict[str, str] = {}
+    room_keys: dict[str, str] = {}
     if not problems:
-        table, base_places = _expand_base_and_room(table, lines, problems)
+        table, base_places = _expand_base_and_room(table, lines, problems, room_keys)
     applied += [_override(table, override, messages) for override in overrides if override not in early_overrides]
-    source = Source(file, lines, tuple(pair for pair in applied if pair is not None), base_places=base_places)
+    pairs = tuple(pair for pair in applied if pair is not None)
+    source = Source(file, lines, pairs, base_places=base_places, room_keys=room_keys)
     problems.extend(find_oversized(table))
     if problems:
         raise ConfigError((*messages, *map(source.describe, problems)))
@@ -235,13 +237,14 @@ def _parse(table: dict[str, Any], text: str, file: str, overrides: Sequence[str]
 
 
 def _expand_base_and_room(
-    document: dict[str, Any], lines: dict[str, int], problems: list[ConfigProblem]
+    document: dict[str, Any], lines: dict[str, int], problems: list[ConfigProblem], room_keys: dict[str, str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Write the values of `base` and `[room]` into the keys that they stand for.
 
     Args:
         lines: Lines of the file; those of keys that [room] writes are added.
         problems: Problems of them are added here.
+        room_keys: The key of [room] for each key that it writes is added here.
 
     Returns:
         The document, and where the keys stand that come from the base.
@@ -273,9 +276,8 @@ def _expand_base_and_room(
             reason = f"is given, and [room] in line {lines.get('room', 1)} sets it by name"
             problems.append(ConfigProblem(key, reason, "keep one of the two"))
     if len(problems) == problem_count:
-        written: dict[str, str] = {}
-        problems.extend(apply_room(table, cast("RoomConfig", room_config), document, written))
-        lines.update({key: lines[room_key] for key, room_key in written.items() if room_key in lines})
+        problems.extend(apply_room(table, cast("RoomConfig", room_config), document, room_keys))
+        lines.update({key: lines[room_key] for key, room_key in room_keys.items() if room_key in lines})
     return table, base_places
 
 
