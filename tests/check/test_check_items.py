@@ -126,6 +126,14 @@ def test_a_vehicle_outside_the_room_is_told_why(scale: tuple[float, float, float
     assert not place.ok and told in place.hint
 
 
+def test_a_vehicle_just_outside_the_room_is_not_asked_for_its_unit() -> None:
+    hand = HandMotion()
+    hand.place = [3.6, 0.4, -1.0]
+    hand.hold(4.0)
+    place = hand.is_done()["position in the room"]
+    assert not place.ok and "metres" not in place.hint
+
+
 # --- clocks ----------------------------------------------------------------------------------------------------------
 
 
@@ -133,6 +141,8 @@ def test_clocks_that_are_answered_show_round_trip_and_drift() -> None:
     found = run_check(seconds=8.0)
     assert state(found, "vehicle clock") is ItemState.GOOD and "drift +0 ppm" in found["vehicle clock"].value
     assert state(found, "source clock") is ItemState.NOTE  # the simulated cameras answer nothing
+    assert "set" not in found["source clock"].hint  # clock.latency_s is given
+    assert "set clock.latency_s" in run_check(["clock.latency_s=0"], seconds=4.0)["source clock"].hint
 
 
 class Answering(HandMotion):
@@ -218,8 +228,9 @@ def test_a_second_vehicle_on_the_link_fails() -> None:
 
 
 def test_the_battery_is_judged_only_if_a_limit_is_given() -> None:
-    assert state(run_check(), "battery") is ItemState.GOOD
+    assert state(run_check(), "battery") is ItemState.UNDETERMINED
     assert state(run_check(wrong=["check.battery_v=14.0"]), "battery") is ItemState.BAD
+    assert state(run_check(wrong=["check.battery_v=4.0"]), "battery") is ItemState.GOOD
 
 
 def test_armed_and_in_the_air_are_told() -> None:

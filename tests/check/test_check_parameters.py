@@ -85,6 +85,9 @@ def test_the_timeout_that_is_wanted_is_one_that_the_room_holds() -> None:
     judged = {t: judge_timeout(3, t, small) for t in (0.7, 0.75, 0.77, 3.0)}
     assert judged[3.0].want.endswith("to 0.7 s")  # 4 t²/2 + (4 t)²/5 = 3 m at 0.76 s
     assert "46.8 m north" in judged[3.0].hint  # 18 + 28.8
+    assert "room.accel_mps2" in judged[3.0].hint  # the other remedy
+    large = load_config("room-ardupilot", ["limits.accel_mps2=[0.5,0.5,0.5]"])
+    assert "accel_mps2" not in judge_timeout(3, 3.0, large).hint  # the timeout is bound by itself, not by the room
     assert [judged[t].state for t in (0.7, 0.75, 0.77)] == [
         ItemState.GOOD, ItemState.NOTE, ItemState.BAD
     ]  # fmt: skip

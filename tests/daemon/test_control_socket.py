@@ -184,6 +184,7 @@ def test_status_is_answered_at_once(rig: Rig) -> None:
         (ask(ask="goto", position_m=[0, 0]), "not understood"),
         (b'{"ask": "goto", "position_m": [NaN, 0, -1]}\n', "not understood"),
         (b'{"ask": "goto", "position_m": [1e999, 0, -1]}\n', "not understood"),
+        (ask(ask="goto", position_m=[0, 0, 1.1]), "up is negative: write -1.1"),
         (ask(ask="goto", position_m=[3.5, 0, 0.5]), "north 3.5 m is outside the admissible box [-3, 3]; down 0.5 m"),
     ],
 )

@@ -83,6 +83,11 @@ def test_a_port_in_use_is_told() -> None:
         open_connection(f"udpin://127.0.0.1:{other.getsockname()[1]}")
 
 
+def test_an_address_of_another_computer_is_told() -> None:
+    with pytest.raises(ConnectionSpecError, match=r"no address of this computer; 0\.0\.0\.0"):
+        open_connection("udpin://192.0.2.7:15560")
+
+
 def test_a_missing_device_is_told() -> None:
     with pytest.raises(ConnectionSpecError, match="check the device"):
         open_connection("serial:///dev/no-such-device:57600")

@@ -16,7 +16,11 @@ def check_clocks(data: CheckData, config: Config) -> list[Item]:
     """Items of the vehicle's clock and of the source's."""
     items = [_check_clock("vehicle clock", data.round_trips.get("vehicle"), _judge_missing_answers(config))]
     if config.source.messages != ("LOCAL_POSITION_NED",):
-        hint = "set clock.latency_s to the source's smallest delay: without answers ages count from the quickest one"
+        hint = (
+            f"without answers, clock.latency_s ({config.clock.latency_s:g} s) is the delay of the quickest position"
+            if config.clock.latency_s
+            else "set clock.latency_s to the source's smallest delay: without answers ages count from the quickest one"
+        )
         items.append(_check_clock("source clock", data.round_trips.get("source"), (ItemState.NOTE, hint)))
         items[-1] = _check_stamps(items[-1], data)
     return items

@@ -120,8 +120,8 @@ def _make_timeout_judge(lowest_s: float) -> ParameterJudge:
             )
             return ParameterVerdict(ItemState.BAD, want, hint)
         hint = (
-            f"Set it to {max_s:.7g} s or less. If setpoints stop, the vehicle keeps accelerating that long. "
-            f"{_describe_distances(tightest, value)}"
+            f"Set it to {max_s:.7g} s or less{_suggest_acceleration(tightest, max_s)}. If setpoints stop, the vehicle "
+            f"keeps accelerating that long. {_describe_distances(tightest, value)}"
         )
         if value > fitting_s * (1.0 + _FLOAT32_TOLERANCE):
             return ParameterVerdict(ItemState.BAD, want, hint)
@@ -129,6 +129,12 @@ def _make_timeout_judge(lowest_s: float) -> ParameterJudge:
         return ParameterVerdict(ItemState.GOOD if is_good else ItemState.NOTE, want, hint)
 
     return judge
+
+
+def _suggest_acceleration(tightest: list[Runaway], max_s: float) -> str:
+    """Return the other remedy, a lower acceleration, where the room and not the longest timeout is the bound."""
+    key = "room.accel_mps2 or limits.accel_mps2"
+    return f", or lower {key} ({tightest[0].axis})" if tightest and max_s < _MAX_TIMEOUT_S else ""
 
 
 def _round_down(max_s: float, min_s: float) -> float | None:

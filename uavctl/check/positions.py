@@ -229,7 +229,7 @@ def _check_room(samples: list[Sample], config: Config) -> Item:
     if uses_camera_system(config):
         hint = f"{CAMERA_AXES}, or the limits of [sets]"
     elif not is_inside:
-        for scale, unit in _UNITS:
+        for scale, unit in _UNITS if _is_far_outside(middle.tolist(), limits) else ():
             if _is_inside((middle / scale).tolist(), limits, config.check.margin_m):
                 hint = f"does the source send {unit}? It has to send metres; else {hint}"
                 break
@@ -240,6 +240,12 @@ def _check_room(samples: list[Sample], config: Config) -> Item:
     return judge_item(
         "position in the room", is_good=is_inside, value=f"({text}) m", want=f"{want} m (sets)", hint=hint
     )
+
+
+def _is_far_outside(position: list[float], limits: dict[str, tuple[float, float]]) -> bool:
+    """Return whether a position is twice as far from the origin as the limits, so that its unit is in doubt."""
+    sides_m = [abs(side) for limit in limits.values() for side in limit if math.isfinite(side)]
+    return max(map(abs, position)) > 2.0 * max(sides_m, default=0.0)
 
 
 def _is_inside(position: list[float], limits: dict[str, tuple[float, float]], margin_m: float) -> bool:

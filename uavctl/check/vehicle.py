@@ -107,6 +107,9 @@ def _check_battery(data: CheckData, config: Config) -> Item:
     if data.battery_v is None:
         return make_item("battery", ItemState.UNDETERMINED, "not reported", want, "check the vehicle's battery monitor")
     value = f"{data.battery_v:.2f} V"
+    if not min_v:
+        hint = "set check.battery_v to the lowest voltage to start with"
+        return make_item("battery", ItemState.UNDETERMINED, f"{value}, not judged", want, hint)
     return judge_item(
         "battery", is_good=data.battery_v >= min_v, value=value, want=want, hint="charge it, or change it"
     )

@@ -256,7 +256,7 @@ def fly(
             flight.start()
         is_landing = False
         while any(flight.is_running() for flight in flights):
-            reason = "asked to" if stopped() else _find_failure(flights, health)
+            reason = "ordered" if stopped() else _find_failure(flights, health)
             if reason and not is_landing:
                 is_landing = True
                 print_message(f"{reason}: all vehicles end their flights")

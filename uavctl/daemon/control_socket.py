@@ -229,8 +229,9 @@ class ControlServer:
         if request.position_m is None:
             return None
         config = self._config
-        problems = find_outside(config.plant, config.sets, request.position_m, "position_m", "place")
-        return "; ".join(problem.reason for problem in problems) or None
+        problems = list(find_outside(config.plant, config.sets, request.position_m, "position_m", "place"))
+        hints = dict.fromkeys(problem.todo for problem in problems)
+        return "; ".join([*(problem.reason for problem in problems), *hints]) or None
 
     def _reply(self, client: _Client, reply: Reply) -> None:
         data = msgspec.json.encode(reply) + b"\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -191,4 +192,6 @@ class SocketConnection(BaseConnection):
             action(address)
         except OSError as error:
             self.close()
+            if error.errno == errno.EADDRNOTAVAIL:
+                advice = "it is no address of this computer; 0.0.0.0 stands for all that it has"
             raise ConnectionSpecError(f"connection {self.url!r}: {error.strerror or error}; {advice}") from error
