@@ -424,15 +424,21 @@ class ClosestApproach(Record, frozen=True, kw_only=True):
     distance_m: float  # of the centres, until both are wrecked
 
 
+class VehicleTruth(Record, frozen=True, kw_only=True):
+    """The simulator's own state of one vehicle in a world of several."""
+
+    system_id: int
+    position_m: Vec3
+    velocity_mps: Vec3
+    mode: str
+    wrecked: bool  # whether a collision broke its rotors
+
+
 class FleetTruth(Record, frozen=True, kw_only=True):
-    """The simulator's own state of all vehicles in one world; one entry a vehicle."""
+    """The simulator's own state of all vehicles in one world."""
 
     at_ns: int
-    vehicles: tuple[int, ...]  # system ids
-    position_m: tuple[Vec3, ...]
-    velocity_mps: tuple[Vec3, ...]
-    mode: tuple[str, ...]
-    wrecked: tuple[bool, ...]  # whether a collision broke its rotors
+    vehicles: tuple[VehicleTruth, ...]
 
 
 class Header(Record, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
 from uavctl.lab.lockstep import FleetFlight, LockstepFlight, fly_fleet
-from uavctl.records import ClosestApproach, Collision, FleetTruth, Truth, Vec3
+from uavctl.records import ClosestApproach, Collision, FleetTruth, Truth, Vec3, VehicleTruth
 from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
 SYSTEM_IDS = (1, 2)
@@ -100,12 +100,17 @@ def test_one_recording_has_the_truth_of_all(head_on: FleetFlight) -> None:
     each = read_truths(head_on)
     assert len(together) == len(each[0]) == len(each[1]) == round(DURATION_S / 0.05)
     for truth, alone in zip(together, zip(*each, strict=True), strict=True):
-        assert truth.vehicles == SYSTEM_IDS
         assert truth.at_ns == alone[0].at_ns == alone[1].at_ns
-        assert truth.position_m == tuple(one.position_m for one in alone)
-        assert truth.velocity_mps == tuple(one.velocity_mps for one in alone)
-        assert truth.mode == tuple(one.mode for one in alone)
-        assert truth.wrecked == tuple("collision" in one.faults for one in alone)
+        assert truth.vehicles == tuple(
+            VehicleTruth(
+                system_id=system_id,
+                position_m=one.position_m,
+                velocity_mps=one.velocity_mps,
+                mode=one.mode,
+                wrecked="collision" in one.faults,
+            )
+            for system_id, one in zip(SYSTEM_IDS, alone, strict=True)
+        )
 
 
 def test_each_recording_replays_alone(head_on: FleetFlight, apart: FleetFlight) -> None:

@@ -18,7 +18,7 @@ from uavctl.cause import Cause
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError, UsageError
 from uavctl.loop import ControlLoop
-from uavctl.records import ClosestApproach, Collision, FleetTruth, Received, Send, Ticked, Truth
+from uavctl.records import ClosestApproach, Collision, FleetTruth, Received, Send, Ticked, Truth, VehicleTruth
 from uavctl.wiring.controller import Prepared
 
 TRUTH = "/sim/truth"
@@ -100,15 +100,17 @@ class _WorldRecord:
         if len(truths) < len(self._ids):
             return
         ordered = [truths[each] for each in range(len(self._ids))]
-        record = FleetTruth(
-            at_ns=truth.at_ns,
-            vehicles=self._ids,
-            position_m=tuple(one.position_m for one in ordered),
-            velocity_mps=tuple(one.velocity_mps for one in ordered),
-            mode=tuple(one.mode for one in ordered),
-            wrecked=tuple(COLLISION_FAULT in one.faults for one in ordered),
+        vehicles = tuple(
+            VehicleTruth(
+                system_id=system_id,
+                position_m=one.position_m,
+                velocity_mps=one.velocity_mps,
+                mode=one.mode,
+                wrecked=COLLISION_FAULT in one.faults,
+            )
+            for system_id, one in zip(self._ids, ordered, strict=True)
         )
-        self._recorder.put(FLEET_TRUTH, truth.at_ns, record)
+        self._recorder.put(FLEET_TRUTH, truth.at_ns, FleetTruth(at_ns=truth.at_ns, vehicles=vehicles))
         del self._truths[truth.at_ns]
 
     def put_collision(self, collision: Collision) -> None:

@@ -23,6 +23,7 @@ def test_every_recorded_type_has_one_topic() -> None:
         "VehicleMotion",
         "InertialSample",
         "RiskRecord",
+        "VehicleTruth",
     }
     types = {
         name
