@@ -27,8 +27,8 @@ BIN = Path(sys.executable).parent
 # One thread of each test process; and each of the processes that tests start would compile what it imports anew if no
 # bytecode were kept.
 _PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""}
-# Test processes on two cores: some tests of the first two options fly in real time, and wait.
-PROCESSES = {"": 3, "--all": 3, "--long": 2}
+# Test processes on two cores. Quick tests that fly in real time mostly wait; with the slow ones, these need a core.
+PROCESSES = {"": 3, "--all": 2, "--long": 2}
 # Expressions of pytest's marks, by the option that asks for these tests.
 MARKS = {"": "not slow and not long and not manual", "--all": "not long and not manual", "--long": "long"}
 
