@@ -25,14 +25,7 @@ from uavctl.config.load import dump_config, parse_recorded
 from uavctl.errors import DesignError, UsageError
 from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
 from uavctl.lab.identify.page import render_identify_page
-from uavctl.lab.identify.result import (
-    Identification,
-    count_fits,
-    describe_gust,
-    describe_loss,
-    identify,
-    refuse_wrong_model,
-)
+from uavctl.lab.identify.result import Identification, count_fits, describe_gust, describe_loss, identify
 from uavctl.wiring.controller import build_flight_design
 
 
@@ -58,7 +51,6 @@ def identify_command(
     refuse_recording_path(target)
     with show_fit_progress(count_fits(history, config)) as advance:
         identification = identify(history, config, advance)
-    refuse_wrong_model(identification.result)
     warnings = (*identification.result.warnings, *find_design_warnings(identification.config))
     result = msgspec.structs.replace(identification.result, warnings=warnings)
     identification = dataclasses.replace(identification, result=result)

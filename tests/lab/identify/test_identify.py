@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import read_tlog
 from uavctl.arrays import Array
-from uavctl.cli import identify as identify_module
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import RecordingError
@@ -373,30 +372,6 @@ def test_an_axis_that_was_not_steered_is_refused_by_name() -> None:
             load_config("room-hahn-stursberg"),
             lambda: None,
         )
-
-
-def make_history_of_axes(positions_m: Array) -> FlightHistory:
-    """Setpoints that change in every axis, with these positions (samples, axes)."""
-    flown = [fly(0.25, 0.3, 1.0, seed=seed, seconds=20.0) for seed in (1, 2, 3)]
-    inputs = np.column_stack([stretch.inputs_mps2[:, 0] for stretch in flown])
-    times_s = np.linspace(0.0, 19.9, len(positions_m))
-    setpoints = SetpointHistory(flown[0].input_times_s, inputs, np.ones(len(inputs), dtype=bool))
-    positions = PositionHistory(times_s, np.zeros(len(times_s)), positions_m)
-    return FlightHistory(setpoints, positions, np.zeros(0, dtype=np.int64))
-
-
-def test_a_model_that_predicts_no_better_than_the_mean_is_not_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The positions are noise that no setpoint has moved."""
-    history = make_history_of_axes(np.random.default_rng(0).standard_normal((100, 3)))
-    config = load_config("room-hahn-stursberg")
-    monkeypatch.setattr(identify_module, "_read_history", lambda *_: (history, config))
-    (tmp_path / "flight.mcap").touch()
-    assert run(["identify", str(tmp_path / "flight.mcap")]) == 1
-    error_text = capsys.readouterr().err
-    assert all(axis in error_text for axis in config.plant.axes)
-    assert [path.name for path in tmp_path.iterdir()] == ["flight.mcap"]
 
 
 @pytest.mark.slow

@@ -424,20 +424,6 @@ def _is_drifting(model: AxisModel) -> bool:
     return isinstance(model, DragLagAxis) and model.drifts
 
 
-def refuse_wrong_model(identified: Identified) -> None:
-    """Refuse a model that predicts the motion of the next second no better than its mean does: R² <= 0.
-
-    Raises:
-        RecordingError: An axis has such a model.
-    """
-    wrong = [f"{response.axis} (R² {response.r2:.2f})" for response in identified.response if response.r2 <= 0.0]
-    if wrong:
-        raise RecordingError(
-            f"the model does not predict the motion in {', '.join(wrong)}, so no configuration is written: do the "
-            "axes of [frame] agree with the vehicle's (`uavctl check --move`)? Then fly again"
-        )
-
-
 def _describe_uncertain_axes(responses: Sequence[AxisResponse]) -> list[str]:
     texts = []
     for response in responses:
