@@ -29,6 +29,9 @@ CHUNK_BYTES = 65_536  # a killed process loses the messages of the last chunk, a
 class SenderRecording:
     """Writes what a sender did; `log_time` is UTC.
 
+    Attributes:
+        failure: Why nothing is written any more; empty as long as it is.
+
     Args:
         names: Names of the vehicles.
         zero_utc_ns: UTC of time 0 of the monotonic clock [ns since 1970].
@@ -44,6 +47,7 @@ class SenderRecording:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another file") from error
         self._names, self._zero_utc_ns = names, zero_utc_ns
+        self.failure = ""
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="", library="uavctl")
         schema = self._writer.register_schema("uavctl.SentPosition", "jsonschema", json.dumps(_SCHEMA).encode())
@@ -55,11 +59,17 @@ class SenderRecording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._file.close()
+        try:
+            if not self.failure:
+                self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.close()
+        except OSError as write_error:
+            self.failure = write_error.strerror or "write error"
 
     def add(self, at_ns: int, vehicle: int, captured_ns: int, length: int, ages_s: tuple[float, ...]) -> None:
-        """Add a position that was sent at `at_ns`, monotonic time."""
+        """Add a position that was sent at `at_ns`, monotonic time; a write error ends the recording alone."""
+        if self.failure:
+            return
         message = {
             "vehicle": self._names[vehicle],
             "captured_ns": captured_ns,
@@ -67,4 +77,7 @@ class SenderRecording:
             "ages_s": dict(zip(self._names, ages_s, strict=True)),
         }
         time_ns = self._zero_utc_ns + at_ns
-        self._writer.add_message(self._channel, time_ns, json.dumps(message).encode(), time_ns)
+        try:
+            self._writer.add_message(self._channel, time_ns, json.dumps(message).encode(), time_ns)
+        except OSError as error:
+            self.failure = error.strerror or "write error"

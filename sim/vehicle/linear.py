@@ -120,7 +120,8 @@ def _find_down_force(plant: PlantConfig, flow: Array, velocity_index: tuple[int,
         return None
     axis, n = plant.axes.index(NED_AXES[2]), len(plant.axes)
     if plant.model == "drag-lag":
-        column: Array = flow[: 3 * n, 4 * n + axis]
+        n_x = 3 * n + len(plant.gust_mps2)  # gusts follow the states of all axes
+        column: Array = flow[:n_x, n_x + n + axis]
     elif plant.model == "velocity-reference":
         column = flow[: 6 * n, 7 * n + 3 * axis]
     else:

@@ -220,8 +220,9 @@ def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShel
 @IN_REAL_TIME
 def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
     page = "docs/fleet.md"
-    (sim,) = find_commands(page, "Try it")
-    check, fly, *orders = (order for order in find_commands(page) if order != sim)
+    sim, four = find_commands(page, "Try it")
+    others = (sim, four, *find_commands(page, "One radio"))
+    check, fly, *orders = (order for order in find_commands(page) if order not in others)
     shell.run(check)
     duo = shell.folder / "duo.toml"
     accepted = f"check.accept={json.dumps(TIMED_ITEMS + TIMEOUTS)}"
@@ -235,6 +236,15 @@ def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
     shell.wait_for_success(wait_order)
     shell.run(land)
     shell.wait_for_end(flight, fly)
+
+
+@pytest.mark.manual
+@IN_REAL_TIME
+def test_the_radio_of_the_page_sends_to_four_vehicles(shell: ManualShell) -> None:
+    _, sim = find_commands("docs/fleet.md", "Try it")
+    (cameras,) = find_commands("docs/fleet.md", "One radio")
+    shell.wait_for_text(shell.start(f"{sim} {LONG_TIMEOUT}"), "system_id 4")
+    shell.run(f"{cameras} --duration 3")
 
 
 @pytest.mark.manual

@@ -40,7 +40,7 @@ def cameras(
 ) -> int:
     """Send the positions of all vehicles of a fleet over one channel; never queues. Ctrl-C ends it.
 
-    Exit code 1: not every vehicle was sent a position.
+    Exit code 1: not every vehicle was sent a position, or the recording lacks some.
     """
     fleet = read_fleet(file)
     problems = list(_find_problems(file, fleet))
@@ -71,6 +71,8 @@ def cameras(
                 direction, _, number = name.partition(" ")
                 side = "source" if direction == "from" else "link"
                 print_message(f"{names[int(number)]}: its {side} is closed: {connections[name].url}")
+    if recording.failure:
+        print_message(f"{path}: the recording lacks positions ({recording.failure}); see to the disk")
     if sender.refused:
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(sender.refused.items()))
         print_message(f"not used: {reasons}")
@@ -78,7 +80,7 @@ def cameras(
     document = {"out": str(path), "sent": counts, "refused": dict(sender.refused)}
     rows = [[name, str(count)] for name, count in counts.items()]
     Common(json=json).show("cameras", document, lambda: make_table("positions sent", ("vehicle", "number"), rows))
-    return 0 if all(counts.values()) else 1
+    return 0 if all(counts.values()) and not recording.failure else 1
 
 
 def _run_once(sender: PositionSender, connections: dict[str, Connection], recording: SenderRecording) -> None:
@@ -130,10 +132,8 @@ def _open_connections(fleet: Fleet) -> Iterator[dict[str, Connection]]:
         connections: dict[str, Connection] = {}
         for number, member in enumerate(fleet.members):
             rules = make_admission_rules(member.config.security)
-            for name, connection in (
-                (f"from {number}", open_source(member.cameras, monotonic_ns, rules)),
-                (f"to {number}", open_connection(_find_target_url(member), monotonic_ns, rules)),
-            ):
-                connections[name] = connection
-                stack.callback(connection.close)
+            source = connections[f"from {number}"] = open_source(member.cameras, monotonic_ns, rules)
+            stack.callback(source.close)
+            target = connections[f"to {number}"] = open_connection(_find_target_url(member), monotonic_ns, rules)
+            stack.callback(target.close)
         yield connections

@@ -63,7 +63,8 @@ class TickLimit:
         """Count while a tick runs, and send the signal at the limit; until `end`."""
         while not self._done.wait(_PERIOD_S):
             self._wakes += self._is_running
-            if self._is_running and self._wakes * _PERIOD_S >= self._limit_s:
+            # The first wake may come right after the tick began.
+            if self._is_running and (self._wakes - 1) * _PERIOD_S >= self._limit_s:
                 self._wakes = 0
                 signal.pthread_kill(thread, _SIGNAL)
 

@@ -17,8 +17,8 @@ from uavctl.arrays import Array
 
 Times = NDArray[np.int64]
 
-# Messages whose arrival is uncertain; older ones count as lost, so a believed age is not too small. With a loss of
-# one half, 20 messages in a row are lost once in a million times.
+# Messages whose arrival is uncertain; of older ones the newest counts as arrived. With a loss of one half, 20 messages
+# in a row are lost once in a million times.
 MAX_UNCERTAIN = 20
 
 
@@ -46,6 +46,7 @@ class AgeBelief:
         self._feedback_delay_ns = feedback_delay_ns
         self._sent: list[tuple[int, int]] = []  # capture and sending of uncertain messages, newest first
         self._known_ns = start_ns  # newest capture that has arrived for certain
+        self._oldest_ns = start_ns  # capture that counts if no uncertain message has arrived
         self.captures_ns = np.empty(MAX_UNCERTAIN + 1, dtype=np.int64) if captures_ns is None else captures_ns
         self._fill()
 
@@ -56,14 +57,16 @@ class AgeBelief:
 
     def add_message(self, captured_ns: int, sent_ns: int) -> None:
         """Note a message with a newer position."""
-        self._sent = [(captured_ns, sent_ns), *self._sent[: MAX_UNCERTAIN - 1]]
+        if len(self._sent) == MAX_UNCERTAIN:
+            self._oldest_ns = self._sent.pop()[0]
+        self._sent = [(captured_ns, sent_ns), *self._sent]
         self._fill()
 
     def add_feedback(self, captured_ns: int, at_ns: int) -> None:
         """Note that a vehicle reported the capture time of its newest position."""
         if captured_ns < self._known_ns:
             return
-        self._known_ns = captured_ns
+        self._known_ns = self._oldest_ns = captured_ns
         settled_ns = at_ns - self._feedback_delay_ns
         self._sent = [sent for sent in self._sent if sent[0] > captured_ns and sent[1] > settled_ns]
         self._fill()
@@ -74,8 +77,8 @@ class AgeBelief:
         for captured_ns, _ in self._sent:
             yield captured_ns, probability * (1.0 - loss)
             probability *= loss
-        yield self._known_ns, probability
+        yield self._oldest_ns, probability
 
     def _fill(self) -> None:
         self.captures_ns[: len(self._sent)] = [captured_ns for captured_ns, _ in self._sent]
-        self.captures_ns[len(self._sent) :] = self._known_ns
+        self.captures_ns[len(self._sent) :] = self._oldest_ns

@@ -22,6 +22,7 @@ from uavctl.schedule.value import compute_age_costs, compute_message_values, pre
 from uavctl.smpc.estimate import add_bias
 from uavctl.wiring.controller import build_plant, compute_settled_covariance
 from uavctl.wiring.link import build_ages
+from uavctl.wiring.rest import build_weights
 
 # An adaptive schedule may let a vehicle wait for two rounds: with less it is hardly free, with more the design, which
 # counts on the longest wait, has larger margins.
@@ -33,8 +34,9 @@ _TAIL_ROUNDS = 400  # rounds of the mean age's sum; the rest is below 1e-15 up t
 class RadioConfig(Section, frozen=True, kw_only=True):
     """The channel that carries the positions of all vehicles of a fleet."""
 
-    bytes_per_s: Annotated[float, Meta(gt=0.0)] | None = None  # on the wire; 57,600 baud are 5,760
-    messages_per_s: Annotated[float, Meta(gt=0.0)] | None = None
+    # A quicker channel needs no schedule; the value of a message is computed for each slot of five seconds.
+    bytes_per_s: Annotated[float, Meta(gt=0.0, le=100_000.0)] | None = None  # on the wire; 57,600 baud are 5,760
+    messages_per_s: Annotated[float, Meta(gt=0.0, le=2000.0)] | None = None
     rate_hz: Annotated[float, Meta(gt=0.0, le=1000.0)] = (
         50.0  # positions a second that the cameras give of each vehicle
     )
@@ -148,7 +150,7 @@ def compute_loads(radio: RadioConfig, configs: Sequence[Config], max_vehicles: i
 def compute_vehicle_costs(config: Config, slot_s: float) -> tuple[Array, Array]:
     """Return the cost of a vehicle's age, and the deviation of its position [m], at ages of 0 … slots (n,)."""
     plant = build_plant(config)
-    cov, state_cost = compute_settled_covariance(config, plant), np.diag(config.cost.state)
+    cov, state_cost = compute_settled_covariance(config, plant), build_weights(config.cost, plant)[0]
     if config.estimator.bias_drift:
         plant = add_bias(plant, config.estimator.bias_drift, force=config.estimator.inertial_std_mps2 > 0.0)
         state_cost = block_diag(state_cost, np.zeros((plant.n_u, plant.n_u)))

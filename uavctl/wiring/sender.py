@@ -28,7 +28,7 @@ from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.message_layout import MessageLayout
 from uavctl.mavlink.messages import Position
 from uavctl.mavlink.positions import PositionDecoder
-from uavctl.records import Vec3
+from uavctl.records import PositionSample, Vec3
 from uavctl.schedule.channel import Channel
 from uavctl.schedule.scheduler import Scheduler
 from uavctl.schedule.value import compute_weight
@@ -72,7 +72,12 @@ class _Target:
         self.next_frame = (0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))  # stamp [us], position, angles
         self.captured_ns_by_stamp: dict[int, int] = {}  # of positions sent
         limits = get_position_limits_m(config).values()
+        self._max_position_m = config.estimator.max_position_m
         self.lower_m, self.upper_m = (np.array(side) for side in zip(*limits, strict=True))
+
+    def is_plausible(self, sample: PositionSample) -> bool:
+        """Return whether the vehicle would not refuse a position as absurd."""
+        return max(map(abs, sample.position_m)) <= self._max_position_m
 
 
 class PositionSender:
@@ -126,7 +131,7 @@ class PositionSender:
         self.refused.update({str(reason): count for reason, count in decoded.bad.items()})
         for message in decoded.messages:
             sample = target.decoder.make_sample(message, at_ns) if isinstance(message, Position) else None
-            if sample is None or not isinstance(message, Position):
+            if sample is None or not isinstance(message, Position) or not target.is_plausible(sample):
                 self.refused[UNUSED] += 1
                 continue
             if self._scheduler.add_position(number, sample.captured_ns):

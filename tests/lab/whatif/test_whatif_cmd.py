@@ -128,6 +128,25 @@ def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest
     assert result["what_if"]["cost"] != own["what_if"]["cost"]
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_figures")
+def test_a_model_with_gusts_moves_the_vehicle_as_one_without(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A gust does not depend on what is flown, and the simulated vehicle has no such state."""
+    flight = tmp_path / "flight"
+    with omit_pages():
+        assert run(["loopback", "--config", "room-px4", "--duration", "6", "--out", str(flight)]) == 0
+    capsys.readouterr()
+    moved = []
+    for number, gusts in enumerate(([], ["plant.gust_mps2=[0.4, 0.4, 0.2]", "plant.gust_s=[1.0, 1.0, 1.0]"])):
+        model = tmp_path / f"model-{number}.toml"
+        model.write_text(dump_config(load_config("room-px4", gusts)), encoding="utf-8")
+        more = ("--model", str(model), "--set", "target.position_m=[1.0, 0.0, -1.2]")
+        moved.append(document(capsys, flight / "flight.mcap", tmp_path / str(number), *more))
+    assert moved[0]["what_if"]["cost"] == pytest.approx(moved[1]["what_if"]["cost"], rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from record_values import values
 from recording_fakes import HEADER
 
+from logs.recording.earlier import complete_record
 from logs.recording.topics import MATRICES, TOPICS, EncodingError, Topic, are_identical, decode, encode, round_plan
 from uavctl.errors import RecordingError
 from uavctl.records import (
@@ -40,8 +41,10 @@ def test_every_record_reads_back_bit_for_bit(topic: Topic) -> None:
         data = encode(record)
         json.loads(data, parse_constant=pytest.fail)  # plain JSON, no bare NaN
         found = decode(topic.name, data, 0)
+        # Records of earlier versions lack fields, which reading adds; texts may be drawn that such records have.
+        written = round_plan(record) if isinstance(record, Plan) else complete_record(record)
         # repr tells every float apart, the sign of zero and NaN included
-        assert repr_whole(found) == repr_whole(round_plan(record) if isinstance(record, Plan) else record)
+        assert repr_whole(found) == repr_whole(written)
 
     check()
 

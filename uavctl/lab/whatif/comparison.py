@@ -103,11 +103,14 @@ def fit_model(history: RecordedFlight, response: VehicleResponse, source: str) -
     From the true states if known, else from the estimates; parts without setpoints are skipped.
 
     Args:
-        response: The model, of as many states as the recorded plant, and its dead time.
+        response: The model, of as many states as the recorded plant has without gusts, and its dead time.
     """
     flight, model = history.flight, response.model
     samples: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
-    states = {sample.at_ns: np.array(sample.state if isinstance(sample, Truth) else sample.mean) for sample in samples}
+    states = {
+        sample.at_ns: np.array(sample.state if isinstance(sample, Truth) else sample.mean)[: len(model.a)]
+        for sample in samples
+    }
     steps = max(1, round(AHEAD_S * 1e9 / model.dt_ns))
     ahead_ns = steps * model.dt_ns
     boundaries = [

@@ -15,7 +15,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -197,10 +197,13 @@ def make_recorded_flight(entries: Iterable[Entry], config: Config, name: str) ->
 def make_response(history: RecordedFlight, plant: PlantConfig) -> VehicleResponse:
     """Return the response of the recorded vehicle with this plant; the simulator's linear one has no dead time.
 
+    Gusts, the last states of a plant, do not depend on inputs, so the response has none.
+
     Raises:
         DesignError: The plant has no continuous motion.
     """
     has_no_dead_time = bool(history.flight.truths) and history.config.sim.plant == "linear"
+    plant = replace(plant, gust_mps2=(), gust_s=())
     return VehicleResponse(make_linear_model(plant), 0 if has_no_dead_time else round(plant.dead_time_s * 1e9))
 
 
@@ -318,7 +321,7 @@ class _ReflownLoop:
                     truth,
                     position_m=_add(truth.position_m, deviation.get_position_m(at_ns)),
                     velocity_mps=_add(truth.velocity_mps, deviation.get_velocity_mps(at_ns)),
-                    state=tuple((np.array(truth.state) + deviation.get_state(at_ns)).tolist()),
+                    state=tuple(map(sum, zip_longest(truth.state, deviation.get_state(at_ns).tolist(), fillvalue=0.0))),
                     input=tuple((np.array(truth.input) + deviation.get_input(at_ns)).tolist()),
                 )
             if self._other is not None:
