@@ -30,7 +30,7 @@ _STATES = frozenset(
 )  # fmt: skip
 _MAX_MISSING = 128  # numbers of a sequence of 256 that are missing at once; more is a step back
 _MAX_LATE = 32  # numbers that a late message lies back: 12 in flights that were looked at
-_MAX_DISORDER = 0.01  # steps back further than that, of the messages: a sender that starts anew makes one
+_MAX_DISORDER = 0.01  # steps back further than that, of the messages: a restart of the sender makes one
 
 
 class LogSender(msgspec.Struct, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uavctl.fleet.boxes import Boxes, find_gaps
-from uavctl.fleet.cell import Cell, CellChoice, Conduct, Plan, Report, decide_cell
+from uavctl.fleet.cell import CellChoice, Conduct, MovingCell, PlannedPath, Report, decide_cell
 from uavctl.fleet.coordinator import CellParameters, advance, begin, issue, receive
 from uavctl.fleet.voronoi import make_voronoi_cells
 
@@ -25,20 +25,20 @@ STARTS_M = np.array([[-2.0, 0.1, -1.2], [2.0, 0.0, -1.2], [0.0, 2.0, -1.2], [0.1
 GOALS_M = STARTS_M[[1, 0, 3, 2, 4]]
 
 
-def gather(cells: list[Cell], step: int) -> Boxes:
+def gather(cells: list[MovingCell], step: int) -> Boxes:
     index = [np.clip(np.arange(STAGES) + step - cell.step, 0, STAGES - 1) for cell in cells]
     pairs = list(zip(cells, index, strict=True))
     return Boxes(np.array([c.lower_m[i] for c, i in pairs]), np.array([c.upper_m[i] for c, i in pairs]))
 
 
-def draw_plan(rng: np.random.Generator, cell: Cell, step: int) -> Plan:
+def draw_plan(rng: np.random.Generator, cell: MovingCell, step: int) -> PlannedPath:
     """Draw a plan inside of a cell, with small margins, towards the goal of the cell or anywhere."""
     lower_m, upper_m = cell.find_limits(step, STAGES - 1)
     place_m = cell.goal_m if rng.random() < 0.7 else rng.uniform(-3.0, 3.0, 3)
     half_m = 0.5 * (upper_m - lower_m)
     margin_m = np.minimum(0.02, half_m)
     mean_m = np.clip(place_m, lower_m + margin_m, upper_m - margin_m)
-    return Plan(step, np.vstack([mean_m[:1], mean_m]), np.vstack([np.zeros((1, 3)), margin_m]))
+    return PlannedPath(step, np.vstack([mean_m[:1], mean_m]), np.vstack([np.zeros((1, 3)), margin_m]))
 
 
 @pytest.mark.parametrize(("loss", "delay"), [(0.0, 0), (0.3, 2), (0.8, 1), (0.3, 12)])
@@ -47,7 +47,7 @@ def test_cells_in_use_are_apart_for_any_fate_of_messages(loss: float, delay: int
     rng = np.random.default_rng(seed)
     state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
     choices = [CellChoice(cell, cell.number) for cell in state.newest]
-    inboxes: list[list[tuple[int, Cell]]] = [[] for _ in choices]
+    inboxes: list[list[tuple[int, MovingCell]]] = [[] for _ in choices]
     sent_reports: list[tuple[int, int, Report]] = []
     taken = refused = 0
     for step in range(150):
@@ -150,6 +150,20 @@ def test_cells_keep_away_from_a_released_vehicle_or_their_vehicle_is_told_to_lan
     # Seen again after two seconds of silence, it may be anywhere: all others land
     state = issue(advance(state, 20), PARAMETERS)
     assert all(cell.land for cell in state.newest[:4])
+
+
+def test_a_cell_that_is_taken_before_a_refused_cell_to_land_in_is_the_claim() -> None:
+    state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
+    state = issue(state, PARAMETERS)
+    first = state.newest[0]
+    released = Report(state.reports[4].plan, np.array([1.0, 0.0, 0.0]), 0, 0, Conduct.FREE)
+    state = issue(advance(receive(state, {4: released}), 20), PARAMETERS)
+    assert state.newest[0].land and state.newest[0].number == first.number + 1
+    plan = PlannedPath(20, np.tile(STARTS_M[0], (STAGES, 1)), np.zeros((STAGES, 3)))
+    state = receive(state, {0: Report(plan, np.zeros(3), first.number, first.number + 1)})
+    assert state.used_numbers[0] == first.number and state.is_decided[0]
+    assert (state.claims.lower_m[0] == first.lower_m[-1]).all()
+    assert (state.claims.upper_m[0] == first.upper_m[-1]).all()
 
 
 def test_buffered_voronoi_cells_contain_their_vehicles_and_are_apart() -> None:

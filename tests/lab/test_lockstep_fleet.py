@@ -11,7 +11,7 @@ from sim.vehicle.airframe import GRAVITY_MPS2
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
-from uavctl.lab.lockstep import FleetFlight, LockstepFlight, fly_fleet
+from uavctl.lab.lockstep import FlownFleet, LockstepFlight, fly_fleet
 from uavctl.records import ClosestApproach, Collision, FleetTruth, Truth, Vec3, VehicleTruth
 from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
@@ -29,17 +29,17 @@ def make_vehicle(number: int, start_m: Vec3, target_m: Vec3, *overrides: str) ->
     return prepare(config, build_flight_design(config))
 
 
-def fly_pair(folder: Path, starts_m: Sequence[Vec3], targets_m: Sequence[Vec3], *overrides: str) -> FleetFlight:
+def fly_pair(folder: Path, starts_m: Sequence[Vec3], targets_m: Sequence[Vec3], *overrides: str) -> FlownFleet:
     pairs = zip(SYSTEM_IDS, starts_m, targets_m, strict=True)
     return fly_fleet([make_vehicle(*pair, *overrides) for pair in pairs], folder)
 
 
-def read_truths(flight: FleetFlight) -> list[list[Truth]]:
+def read_truths(flight: FlownFleet) -> list[list[Truth]]:
     return [list(read_kind(path, Truth)) for path in flight.paths]
 
 
 @pytest.fixture(scope="module")
-def apart(tmp_path_factory: pytest.TempPathFactory) -> FleetFlight:
+def apart(tmp_path_factory: pytest.TempPathFactory) -> FlownFleet:
     """Two vehicles whose ways are 2 m apart."""
     starts: list[Vec3] = [(-1.0, -1.0, -1.0), (1.0, 1.0, -1.0)]
     targets: list[Vec3] = [(1.0, -1.0, -1.2), (-1.0, 1.0, -1.2)]
@@ -47,13 +47,13 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> FleetFlight:
 
 
 @pytest.fixture(scope="module")
-def head_on(tmp_path_factory: pytest.TempPathFactory) -> FleetFlight:
+def head_on(tmp_path_factory: pytest.TempPathFactory) -> FlownFleet:
     """Two vehicles that change places on one line."""
     ends: list[Vec3] = [(-1.5, 0.0, -1.2), (1.5, 0.0, -1.2)]
     return fly_pair(tmp_path_factory.mktemp("head-on"), ends, ends[::-1])
 
 
-def test_two_vehicles_with_separate_ways_arrive_and_hold(apart: FleetFlight) -> None:
+def test_two_vehicles_with_separate_ways_arrive_and_hold(apart: FlownFleet) -> None:
     assert apart.collisions == ()
     assert all(status.ok for status in apart.statuses)
     for truths, (north_m, east_m) in zip(read_truths(apart), ((1.0, -1.0), (-1.0, 1.0)), strict=True):
@@ -65,7 +65,7 @@ def test_two_vehicles_with_separate_ways_arrive_and_hold(apart: FleetFlight) -> 
     assert closest.distance_m == pytest.approx(sampled_m, abs=0.01)
 
 
-def test_a_vehicle_of_two_flies_as_alone_bit_for_bit(apart: FleetFlight, tmp_path: Path) -> None:
+def test_a_vehicle_of_two_flies_as_alone_bit_for_bit(apart: FlownFleet, tmp_path: Path) -> None:
     lone = LockstepFlight(make_vehicle(2, (1.0, 1.0, -1.0), (-1.0, 1.0, -1.2)), tmp_path / "flight.mcap")
     try:
         lone.fly(lambda _: True)
@@ -74,7 +74,7 @@ def test_a_vehicle_of_two_flies_as_alone_bit_for_bit(apart: FleetFlight, tmp_pat
     assert list(read_kind(tmp_path / "flight.mcap", Truth)) == read_truths(apart)[1]
 
 
-def test_two_vehicles_sent_at_each_other_collide_and_fall(head_on: FleetFlight) -> None:
+def test_two_vehicles_sent_at_each_other_collide_and_fall(head_on: FlownFleet) -> None:
     (collision,) = head_on.collisions
     assert collision.vehicles == SYSTEM_IDS
     assert collision.distance_m < 0.14
@@ -89,13 +89,13 @@ def test_two_vehicles_sent_at_each_other_collide_and_fall(head_on: FleetFlight) 
         assert truths[-1].velocity_mps == (0.0, 0.0, 0.0)
 
 
-def test_the_recordings_tell_the_collision_and_the_closest_approach(head_on: FleetFlight) -> None:
+def test_the_recordings_tell_the_collision_and_the_closest_approach(head_on: FlownFleet) -> None:
     for path in (*head_on.paths, head_on.world_path):
         assert tuple(read_kind(path, Collision)) == head_on.collisions
         assert tuple(read_kind(path, ClosestApproach)) == head_on.closest_approaches
 
 
-def test_one_recording_has_the_truth_of_all(head_on: FleetFlight) -> None:
+def test_one_recording_has_the_truth_of_all(head_on: FlownFleet) -> None:
     together = list(read_kind(head_on.world_path, FleetTruth))
     each = read_truths(head_on)
     assert len(together) == len(each[0]) == len(each[1]) == round(DURATION_S / 0.05)
@@ -113,12 +113,12 @@ def test_one_recording_has_the_truth_of_all(head_on: FleetFlight) -> None:
         )
 
 
-def test_each_recording_replays_alone(head_on: FleetFlight, apart: FleetFlight) -> None:
+def test_each_recording_replays_alone(head_on: FlownFleet, apart: FlownFleet) -> None:
     for path in (*head_on.paths, *apart.paths):
         assert run(["log", "replay", str(path)]) == 0
 
 
-def test_the_same_seeds_give_the_same_flights(head_on: FleetFlight, tmp_path: Path) -> None:
+def test_the_same_seeds_give_the_same_flights(head_on: FlownFleet, tmp_path: Path) -> None:
     ends: list[Vec3] = [(-1.5, 0.0, -1.2), (1.5, 0.0, -1.2)]
     again = fly_pair(tmp_path, ends, ends[::-1])
     assert again.collisions == head_on.collisions

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from uavctl.fleet.cell import Cell, CellChoice, Conduct
+from uavctl.fleet.cell import CellChoice, Conduct, MovingCell
 from uavctl.lab.swaps import SwapCase, SwapWorld, build_swap_design, fly_swap, make_circle, measure_distances
 from uavctl.smpc.conditioned.design import ConditionedDesign
 
@@ -36,7 +36,7 @@ def test_a_pair_is_too_close_at_most_as_often_as_one_of_both_is_outside() -> Non
     stages = world.parameters.stages
     for i, vehicle in enumerate(world.vehicles):
         lower_m, upper_m = (np.tile(side[i], (stages, 1)) for side in sides)
-        vehicle.choice = CellChoice(Cell(1, 0, lower_m, upper_m, -begins_m[i] * 2.0), 1)
+        vehicle.choice = CellChoice(MovingCell(1, 0, lower_m, upper_m, -begins_m[i] * 2.0), 1)
     outside, near, steps = np.zeros(2), 0, 0
     for step in range(1500):
         world.advance()

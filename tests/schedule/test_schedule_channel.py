@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.schedule.channel import Budget, Channel, compute_frame_bytes
+from uavctl.schedule.channel import Budget, BudgetedChannel, compute_frame_bytes
 
 
 def test_the_length_of_a_position_is_that_of_pymavlinks_frame() -> None:
@@ -27,7 +27,7 @@ def test_a_radio_of_57600_baud_carries_130_positions_a_second() -> None:
 
 @given(pauses_ns=st.lists(st.integers(0, 30_000_000), min_size=1, max_size=200))
 def test_no_interval_has_more_messages_than_the_budget_carries(pauses_ns: list[int]) -> None:
-    channel, at_ns, starts_ns = Channel(Budget(messages_per_s=100.0)), 0, []
+    channel, at_ns, starts_ns = BudgetedChannel(Budget(messages_per_s=100.0)), 0, []
     for pause_ns in pauses_ns:
         at_ns += pause_ns
         if channel.is_free(at_ns):
@@ -39,7 +39,7 @@ def test_no_interval_has_more_messages_than_the_budget_carries(pauses_ns: list[i
 
 
 def test_a_late_process_loses_no_budget() -> None:
-    channel, at_ns = Channel(Budget(messages_per_s=100.0)), 0
+    channel, at_ns = BudgetedChannel(Budget(messages_per_s=100.0)), 0
     for _ in range(100):
         at_ns += channel.compute_remaining_ns(at_ns) + 900_000  # woken 0.9 ms late each time
         channel.occupy(at_ns, 44)
@@ -47,7 +47,7 @@ def test_a_late_process_loses_no_budget() -> None:
 
 
 def test_an_occupied_channel_takes_nothing() -> None:
-    channel = Channel(Budget(messages_per_s=100.0))
+    channel = BudgetedChannel(Budget(messages_per_s=100.0))
     channel.occupy(0, 44)
     with pytest.raises(ValueError, match="is_free"):
         channel.occupy(9_999_999, 44)

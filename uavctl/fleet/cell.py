@@ -20,7 +20,7 @@ KEPT_TOLERANCE_M = 1e-6  # excess of a plan over a cell that is rounding of its 
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class MovingCell:
     """Boxes of one vehicle: box s holds from step `step` + s to the next step, the last one for good."""
 
     number: int  # larger than that of each older cell of the vehicle
@@ -39,7 +39,7 @@ class Cell:
         lower_m, upper_m = self.lower_m[index], self.upper_m[index]
         return np.maximum(lower_m[:-1], lower_m[1:]), np.minimum(upper_m[:-1], upper_m[1:])
 
-    def compute_excess_m(self, step: int, plan: Plan) -> Array:
+    def compute_excess_m(self, step: int, plan: PlannedPath) -> Array:
         """Compute how far a plan with its margins is outside in stages 1 … H, (H, 3) [m]; 0 is inside."""
         plan = plan.advance(step)
         lower_m, upper_m = self.find_limits(step, len(plan.mean_m) - 1)
@@ -48,17 +48,17 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class PlannedPath:
     """Positions of a plan, one row a step; it rests in the last one."""
 
     step: int  # of the first row
     mean_m: Array  # (H+1, 3)
     margin_m: Array  # back-off of the limits of each position (H+1, 3)
 
-    def advance(self, step: int) -> Plan:
+    def advance(self, step: int) -> PlannedPath:
         """Return the plan from a later step on."""
         index = np.minimum(np.arange(len(self.mean_m)) + step - self.step, len(self.mean_m) - 1)
-        return Plan(step, self.mean_m[index], self.margin_m[index])
+        return PlannedPath(step, self.mean_m[index], self.margin_m[index])
 
 
 class Conduct(Enum):
@@ -72,7 +72,7 @@ class Conduct(Enum):
 class Report:
     """Report of a vehicle to the coordinator."""
 
-    plan: Plan  # plan in progress, from the step of the report on; its first row is the position
+    plan: PlannedPath  # plan in progress, from the step of the report on; its first row is the position
     velocity_mps: Array  # at the first row (3,)
     in_use: int  # number of the cell in use
     decided: int  # number of the newest cell that was taken or refused
@@ -88,11 +88,11 @@ class Report:
 class CellChoice:
     """Cell in use, and the last number decided."""
 
-    cell: Cell
+    cell: MovingCell
     decided: int
 
 
-def decide_cell(choice: CellChoice, new: Cell, step: int, plan: Plan) -> CellChoice:
+def decide_cell(choice: CellChoice, new: MovingCell, step: int, plan: PlannedPath) -> CellChoice:
     """Take or refuse a new cell at a step, by the plan in progress or by a new one."""
     if new.number <= choice.decided:
         return choice

@@ -22,7 +22,7 @@ import numpy as np
 
 from uavctl.arrays import Array, Flags
 from uavctl.fleet.boxes import Bounds, Boxes, divide_pairs, find_gaps, get_axis_distances_m
-from uavctl.fleet.cell import Cell, Conduct, Plan, Report
+from uavctl.fleet.cell import Conduct, MovingCell, PlannedPath, Report
 from uavctl.fleet.obstacles import find_reach
 from uavctl.fleet.right_of_way import Ways, choose_guides
 
@@ -57,7 +57,8 @@ class CoordinatorState:
     used: Boxes  # cells reported in use
     used_numbers: tuple[int, ...]
     pending: Boxes  # hull of all cells issued since
-    newest: tuple[Cell, ...]  # newest cell of each vehicle
+    newest: tuple[MovingCell, ...]  # newest cell of each vehicle
+    previous: tuple[MovingCell, ...]  # the one before; a cell to land in is issued before it is decided
     reports: tuple[Report, ...]  # newest report of each vehicle
     goals_m: Array  # place that each vehicle is to reach (N, 3)
 
@@ -92,13 +93,15 @@ def begin(step: int, positions_m: Array, goals_m: Array, parameters: CellParamet
             f"vehicles {first} and {second} begin too near to each other for cells {parameters.distance_m:g} m apart:"
             f" place them {parameters.distance_m + 2.0 * half_m:g} m apart, north or east"
         )
-    rest = [Plan(step, np.tile(place, (stages, 1)), np.zeros((stages, 3))) for place in positions_m]
+    cells = tuple(MovingCell(START_NUMBER, step, lower_m[i], upper_m[i], place) for i, place in enumerate(positions_m))
+    rest = [PlannedPath(step, np.tile(place, (stages, 1)), np.zeros((stages, 3))) for place in positions_m]
     return CoordinatorState(
         step=step,
         used=used,
         used_numbers=(START_NUMBER,) * len(positions_m),
         pending=Boxes.make_empty(len(positions_m), stages),
-        newest=tuple(Cell(START_NUMBER, step, lower_m[i], upper_m[i], place) for i, place in enumerate(positions_m)),
+        newest=cells,
+        previous=cells,
         reports=tuple(Report(plan, np.zeros(3), START_NUMBER, START_NUMBER) for plan in rest),
         goals_m=goals_m,
     )
@@ -112,19 +115,18 @@ def advance(state: CoordinatorState, step: int) -> CoordinatorState:
 
 def receive(state: CoordinatorState, reports: Mapping[int, Report]) -> CoordinatorState:
     """Take up reports by the number of the vehicle; older ones than the newest known change nothing."""
-    newest, numbers = list(state.reports), list(state.used_numbers)
-    is_taken, is_refused = np.zeros(len(newest), dtype=bool), np.zeros(len(newest), dtype=bool)
+    newest, numbers, in_use = list(state.reports), list(state.used_numbers), list(state.newest)
+    is_taken, is_decided = np.zeros(len(newest), dtype=bool), np.zeros(len(newest), dtype=bool)
     for i, report in reports.items():
         if report.order < newest[i].order:
             continue
-        newest[i], number = report, state.newest[i].number
-        is_taken[i] = report.in_use == number != numbers[i]
-        is_refused[i] = report.decided >= number and report.in_use == numbers[i]
-        if is_taken[i]:
-            numbers[i] = number
-    cells = _gather_boxes(state.newest, state.step)
-    pending = Boxes.make_empty(*state.used.lower_m.shape[:2]).take(is_taken | is_refused, state.pending)
-    used = cells.take(is_taken, state.used)
+        newest[i] = report
+        for cell in (state.previous[i], state.newest[i]):
+            if report.in_use == cell.number != numbers[i]:
+                is_taken[i], in_use[i], numbers[i] = True, cell, cell.number
+        is_decided[i] = report.decided >= state.newest[i].number and report.in_use == numbers[i]
+    pending = Boxes.make_empty(*state.used.lower_m.shape[:2]).take(is_decided, state.pending)
+    used = _gather_boxes(in_use, state.step).take(is_taken, state.used)
     return replace(state, used=used, pending=pending, used_numbers=tuple(numbers), reports=tuple(newest))
 
 
@@ -160,13 +162,17 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     cells = Boxes(lower_m, upper_m)
     is_new &= ~cells.is_empty
     newest = tuple(
-        Cell(cell.number + 1, step, lower_m[i], upper_m[i], guides_m[i], bool(must_land[i])) if is_new[i] else cell
+        MovingCell(cell.number + 1, step, lower_m[i], upper_m[i], guides_m[i], bool(must_land[i]))
+        if is_new[i]
+        else cell
         for i, cell in enumerate(state.newest)
     )
-    return replace(state, pending=state.pending.cover(cells).take(is_new, state.pending), newest=newest)
+    previous = tuple(state.newest[i] if is_new[i] else cell for i, cell in enumerate(state.previous))
+    pending = state.pending.cover(cells).take(is_new, state.pending)
+    return replace(state, pending=pending, newest=newest, previous=previous)
 
 
-def _gather_boxes(cells: Sequence[Cell], step: int) -> Boxes:
+def _gather_boxes(cells: Sequence[MovingCell], step: int) -> Boxes:
     """Gather the boxes of cells from a step on."""
     stages = np.arange(len(cells[0].lower_m))
     index = [np.minimum(stages + step - cell.step, len(stages) - 1) for cell in cells]

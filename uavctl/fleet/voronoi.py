@@ -11,19 +11,19 @@ import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.fleet.boxes import Boxes, divide_pairs
-from uavctl.fleet.cell import Cell
+from uavctl.fleet.cell import MovingCell
 from uavctl.fleet.coordinator import CellParameters
 
 
 def make_voronoi_cells(
     positions_m: Array, guides_m: Array, number: int, step: int, parameters: CellParameters
-) -> tuple[Cell, ...]:
+) -> tuple[MovingCell, ...]:
     """Make a cell for each vehicle from the positions (N, 3) last reported; two that are too near get none apart."""
     points = Boxes(positions_m[:, None], positions_m[:, None])
     bounds = divide_pairs(points, points, parameters.distance_m)
     lower_m = np.maximum(bounds.lower_m, parameters.room_lower_m)
     upper_m = np.minimum(bounds.upper_m, parameters.room_upper_m)
     return tuple(
-        Cell(number, step, low_m, high_m, guide_m)
+        MovingCell(number, step, low_m, high_m, guide_m)
         for low_m, high_m, guide_m in zip(lower_m, upper_m, guides_m, strict=True)
     )

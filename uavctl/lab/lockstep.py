@@ -302,7 +302,7 @@ class LockstepFlight:
 
 
 @dataclass(frozen=True)
-class FleetFlight:
+class FlownFleet:
     """Flights of a fleet that are over: what flew, what was recorded, and how the vehicles met."""
 
     loops: tuple[ControlLoop, ...]
@@ -319,7 +319,7 @@ def fly_fleet(
     *,
     observers: Sequence[TickObserver | None] | None = None,
     landing_s: float | None = None,
-) -> FleetFlight:
+) -> FlownFleet:
     """Fly vehicles in one world and virtual time, into recordings in a folder; see `LockstepFleet`.
 
     The recordings are `vehicle-ID/flight.mcap`, with the system id, and `world.mcap`.
@@ -331,4 +331,4 @@ def fly_fleet(
         fleet.fly(lambda _: True, observers=observers, landing_s=landing_s)
     finally:
         statuses = fleet.close()
-    return FleetFlight(fleet.loops, paths, world_path, statuses, fleet.collisions, fleet.closest_approaches)
+    return FlownFleet(fleet.loops, paths, world_path, statuses, fleet.collisions, fleet.closest_approaches)

@@ -19,7 +19,7 @@ import numpy as np
 from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.fleet.boxes import DOWNWASH
-from uavctl.fleet.cell import Cell, CellChoice, Conduct, Plan, Report, decide_cell
+from uavctl.fleet.cell import CellChoice, Conduct, MovingCell, PlannedPath, Report, decide_cell
 from uavctl.fleet.coordinator import START_NUMBER, CellParameters, CoordinatorState, advance, begin, issue, receive
 from uavctl.fleet.right_of_way import Ways, choose_guides
 from uavctl.fleet.voronoi import make_voronoi_cells
@@ -95,7 +95,7 @@ class _Vehicle:
     plan: Answer
     plan_step: int
     age: int = 0
-    inbox: list[tuple[int, Cell]] = field(default_factory=list)  # with the step of arrival
+    inbox: list[tuple[int, MovingCell]] = field(default_factory=list)  # with the step of arrival
     conduct: Conduct = Conduct.CELL
 
 
@@ -228,7 +228,7 @@ class SwapWorld:
         )
         self._send(self._reports, (i, report))
 
-    def _decide(self, i: int, vehicle: _Vehicle, cell: Cell) -> None:
+    def _decide(self, i: int, vehicle: _Vehicle, cell: MovingCell) -> None:
         if cell.number <= vehicle.choice.decided:
             return
         if self.case.method == "voronoi":
@@ -247,11 +247,11 @@ class SwapWorld:
         if vehicle.choice.cell.land:
             self.landed.add(i)
 
-    def _describe_plan(self, answer: Answer, step: int) -> Plan:
+    def _describe_plan(self, answer: Answer, step: int) -> PlannedPath:
         rows, index = self._find_rows(), list(self.design.plant.position_index)
         # The larger back-off of the two sides
         margin_m = np.maximum(answer.backoff_x[:, rows[0]], answer.backoff_x[:, rows[1]])
-        return Plan(step, answer.states[:, index], margin_m)
+        return PlannedPath(step, answer.states[:, index], margin_m)
 
     def _find_rows(self) -> tuple[list[int], list[int]]:
         """Find the rows of the upper and lower limits of the positions."""
@@ -259,7 +259,7 @@ class SwapWorld:
         upper, lower = ([int(np.flatnonzero(sign * c[:, i] > 0.0)[0]) for i in index] for sign in (1.0, -1.0))
         return upper, lower
 
-    def _solve(self, x: Array, age: int, cell: Cell, step: int) -> Answer:
+    def _solve(self, x: Array, age: int, cell: MovingCell, step: int) -> Answer:
         """Plan inside of a cell."""
         design, (upper, lower) = self.design, self._find_rows()
         lower_m, upper_m = cell.find_limits(step, design.horizon)

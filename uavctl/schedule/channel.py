@@ -38,7 +38,7 @@ class Budget:
         return math.ceil(SECOND_NS * max(by_messages_s, by_bytes_s))
 
 
-class Channel:
+class BudgetedChannel:
     """Time at which the channel is free again; nothing waits in it."""
 
     def __init__(self, budget: Budget) -> None:

@@ -1,9 +1,9 @@
 """Choice of the vehicle for the next message.
 
-A rule gives each vehicle a score, and the largest one is served. In addition nobody waits longer than M slots: vehicle
-i, last served in slot l_i, has the deadline d_i = l_i + M. Let d_(1) <= d_(2) <= … be sorted, in slot t. If d_(k) =
-t + k - 1 for some k, the next k slots belong to the first k vehicles; then the choice is among those of the smallest
-such k, else among all.
+A rule gives each vehicle a score, and the largest one is served. In addition no vehicle waits longer than M slots.
+Vehicle i, last served in slot l_i, has the deadline d_i = l_i + M. Let d_(1) <= d_(2) <= … be sorted, in slot t. If
+d_(k) = t + k - 1 for some k, the next k slots belong to the first k vehicles; then the choice is among those of the
+smallest such k, else among all.
 
 **Statement.** Let M >= N, and let each vehicle have a new position at the latest N slots after its last message. Then
 every vehicle is served at least once in any M slots.
@@ -15,7 +15,7 @@ slot t + 1, and its first row d_(1) >= t is the statement. One of the k vehicles
 their l_i differ and are at most t + k - 1 - M, so the first one was served M >= N slots ago. ∎
 
 A round of N slots longer than the cameras' period meets the assumption. In a shorter one, a vehicle may wait for its
-next position in addition. A vehicle that was away for more than M slots begins anew at its return: it becomes the last
+next position in addition. A vehicle that was away for more than M slots begins again at its return: it becomes the last
 of at most N vehicles, and the invariant holds for the others.
 """
 
@@ -149,7 +149,7 @@ class Scheduler:
             vehicle.belief.add_feedback(captured_ns, at_ns)
 
     def choose(self, at_ns: int) -> int | None:
-        """Choose the vehicle that is served now, and note its message; None if nobody has a new position."""
+        """Choose the vehicle that is served now, and note its message; None if no vehicle has a new position."""
         candidates = self._find_candidates()
         if not candidates:
             return None

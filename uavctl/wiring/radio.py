@@ -41,7 +41,7 @@ class RadioConfig(Section, frozen=True, kw_only=True):
         50.0  # positions a second that the cameras give of each vehicle
     )
     schedule: ScheduleName = "value"
-    max_wait_s: Annotated[float, Meta(gt=0.0, le=60.0)] | None = None  # nobody waits longer; None: one or two rounds
+    max_wait_s: Annotated[float, Meta(gt=0.0, le=60.0)] | None = None  # None: one or two rounds
     loss: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0  # probability that a message is lost
     feedback_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0  # longest time to a vehicle's report; 0: none comes
     signed: bool = False  # messages carry a signature

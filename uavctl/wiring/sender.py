@@ -29,7 +29,7 @@ from uavctl.mavlink.message_layout import MessageLayout
 from uavctl.mavlink.messages import Position
 from uavctl.mavlink.positions import PositionDecoder
 from uavctl.records import PositionSample, Vec3
-from uavctl.schedule.channel import Channel
+from uavctl.schedule.channel import BudgetedChannel
 from uavctl.schedule.scheduler import Scheduler
 from uavctl.schedule.value import compute_weight
 from uavctl.wiring.radio import (
@@ -113,7 +113,7 @@ class PositionSender:
         values, stds_m = zip(*(build_message_values(config, radio) for config in configs), strict=True)
         self._wait_stds_m = [float(stds[min(max_wait_slots, len(stds) - 1)]) for stds in stds_m]
         self._quantiles = [compute_quantile(config) for config in configs]
-        self._channel = Channel(make_budget(radio))
+        self._channel = BudgetedChannel(make_budget(radio))
         self._scheduler = Scheduler(
             radio.schedule,
             np.array(values),
@@ -156,7 +156,7 @@ class PositionSender:
         return self._channel.compute_remaining_ns(at_ns)
 
     def send_next(self, at_ns: int) -> SentPosition | None:
-        """Return the position that goes out now; None if the channel is occupied or nobody has a new one."""
+        """Return the position that goes out now; None if the channel is occupied or no vehicle has a new one."""
         if not self._channel.is_free(at_ns):
             return None
         if at_ns - self._weighted_ns >= WEIGHT_PERIOD_NS:
