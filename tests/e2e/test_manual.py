@@ -60,7 +60,8 @@ TIMED_ITEMS = [
     "vehicle clock",
     "source clock",
 ]
-# Flights in real time follow each other; pages of commands run beside them, with less of the processor.
+# Flights in real time follow each other: they share the vehicle's lock below /tmp, and the processor. Pages without a
+# flight run beside them, with less of the processor.
 IN_REAL_TIME = pytest.mark.xdist_group("real time")
 BESIDE = ("nice", "-n", "5")
 READER_S = 3.0  # a reader watches the vehicle after an order; `identify` needs 5 s of flight
@@ -130,7 +131,14 @@ def test_the_tables_name_commands_of_the_manual() -> None:
 
 
 @pytest.mark.manual
-@pytest.mark.parametrize("page", [page for page, commands in COMMANDS.items() if commands])
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[IN_REAL_TIME] if any(line.startswith("uavctl fly ") for line in commands) else [])
+        for page, commands in COMMANDS.items()
+        if commands
+    ],
+)
 def test_the_commands_of_a_page_succeed(page: str, shell: ManualShell, flown: Path) -> None:
     shell.prefix = (*BESIDE, *shell.prefix)
     shutil.copytree(flown, shell.folder, dirs_exist_ok=True)
