@@ -10,7 +10,7 @@ from collections import Counter, deque
 from typing import NamedTuple
 
 from uavctl.mavlink.messages import CommandAck, StatusText
-from uavctl.records import Command, InertialSample, PositionSample, VehicleMotion, VehicleStatus
+from uavctl.records import CellMessage, Command, InertialSample, PositionSample, VehicleMotion, VehicleStatus
 
 MAX_ORDERS = 16  # that wait for a tick
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
@@ -28,6 +28,7 @@ class TickMessages(NamedTuple):
     motion: VehicleMotion | None  # the newest one; None if none came
     messages: tuple[CommandAck | StatusText, ...]
     orders: tuple[Command, ...]
+    cell: CellMessage | None  # the newest moving cell; None if none came
 
 
 class Inbox:
@@ -36,6 +37,7 @@ class Inbox:
     def __init__(self) -> None:
         self._items: deque[tuple[int, ReceivedItem]] = deque()
         self._orders: deque[Command] = deque()
+        self._cell: CellMessage | None = None
 
     def add(self, item: ReceivedItem, at_ns: int) -> None:
         """Add a message that arrived at `at_ns`."""
@@ -47,6 +49,11 @@ class Inbox:
             return False
         self._orders.append(command)
         return True
+
+    def put_cell(self, cell: CellMessage) -> None:
+        """Put a moving cell for the next tick; it replaces one with a smaller number."""
+        if self._cell is None or (cell.exits, cell.number) > (self._cell.exits, self._cell.number):
+            self._cell = cell
 
     def take(self, at_ns: int) -> TickMessages:
         """Take the inputs that are due in the tick of `at_ns`."""
@@ -70,11 +77,14 @@ class Inbox:
                     inertial.append(item)
                 case _:
                     messages.append(item)
-        orders = tuple(self._orders)
+        orders, cell = tuple(self._orders), self._cell
+        self._cell = None
         self._items = later_items
         self._orders.clear()
         newest_inertial = tuple(inertial[-MAX_INERTIAL:])
-        return TickMessages(_select_newest(samples), newest_inertial, tuple(statuses), motion, tuple(messages), orders)
+        return TickMessages(
+            _select_newest(samples), newest_inertial, tuple(statuses), motion, tuple(messages), orders, cell
+        )
 
 
 def _select_newest(samples: list[PositionSample]) -> tuple[PositionSample, ...]:

@@ -19,9 +19,11 @@ from msgspec.structs import replace
 from uavctl.account import FlightAccount
 from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
+from uavctl.cell_report import find_conduct, make_report
 from uavctl.config import Config
 from uavctl.errors import TickOverdueError, in_words
 from uavctl.event_codes import EventCode
+from uavctl.fleet.cell import parse_cell
 from uavctl.flight.controller import Controller
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
@@ -35,11 +37,14 @@ from uavctl.mavlink.landing import LandingRequest, LandingTarget
 from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.relay import Relay, describe_relay
 from uavctl.records import (
+    CellMessage,
+    CellReport,
     Command,
     ControlMode,
     Datagram,
     Decision,
     Ending,
+    Estimate,
     Event,
     InertialSample,
     InternalError,
@@ -112,6 +117,7 @@ class ControlLoop:
         self._vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
         self._decision: Decision | None = None
+        self._estimate: Estimate | None = None
         self._external_solve_ns = 0  # time that a controller of another package took in the last tick
         self._frozen_ns: int | None = None  # the last tick with frozen positions
         # The last tick in which positions contradicted the vehicle's climb or landing
@@ -264,7 +270,7 @@ class ControlLoop:
         begin_ns = self._stopwatch()
         output = self._run_core(inputs, notices, core_error)
         step_ns = self._stopwatch() - begin_ns
-        self._decision = output.decision
+        self._decision, self._estimate = output.decision, output.estimate
         self._record_output(output, at_ns)
         self.account.breach_reason = self.breach_reason
         self.account.update_vehicle(at_ns, self._vehicle)
@@ -460,6 +466,27 @@ class ControlLoop:
         self.account.takes_off = self.account.takes_off or command.order is Order.TAKE_OFF
         return True
 
+    def put_cell(self, cell: CellMessage) -> str:
+        """Put a moving cell for the next tick; return why it is refused, empty if it is not."""
+        if self._controller.cell_rows is None:
+            return "this flight has no moving cells: mission.cells is false"
+        try:
+            parse_cell(cell)
+        except ValueError as error:
+            return str(error)
+        self._inbox.put_cell(cell)
+        return ""
+
+    def report_cell(self) -> CellReport | None:
+        """Report to the coordinator of the cells how the vehicle moves; None before its position is known."""
+        if self._decision is None or self._estimate is None or self._controller.cell_rows is None:
+            return None
+        conduct = find_conduct(self.handover_state, self._vehicle, self._state)
+        height_m = self._hand_over.height_m if self._hand_over.is_ordered_flight else 0.0
+        return make_report(
+            self._state, self._controller, self._estimate, self._decision, self.handover_state, conduct, height_m
+        )
+
     @property
     def outside(self) -> str:
         """Name of the controller of another package that plans; empty where one of ours does."""
@@ -507,6 +534,7 @@ class ControlLoop:
             stop=stop,
             commands=arrivals.orders,
             answered_ns=self._external_solve_ns,
+            cell=arrivals.cell,
         )
         self._external_solve_ns = 0
         return inputs
@@ -531,6 +559,8 @@ class ControlLoop:
             self._put("/uavctl/link_estimate", at_ns, output.link)
         if output.plan is not None:
             self._put("/uavctl/plan", at_ns, output.plan)
+        if output.cell is not None:
+            self._put("/uavctl/cell", at_ns, output.cell)
         self._put("/uavctl/decision", at_ns, output.decision)
         for event in output.events:
             self._put("/uavctl/event", at_ns, event)

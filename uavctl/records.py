@@ -257,6 +257,54 @@ class Command(Record, frozen=True, kw_only=True):
     flown_ns: int | None = None  # time at which the daemon before this one took the vehicle over
 
 
+class CellMessage(Record, frozen=True, kw_only=True):
+    """A moving cell on its way to a vehicle: box s holds from step `step` + s to the next step, the last one for good.
+
+    Step n begins at n Δt of the clock that all vehicles share.
+    """
+
+    exits: int  # times that the vehicle had left its cell when this one was issued; it takes no other
+    number: int  # larger than that of each older cell of the vehicle
+    step: int  # of the first box
+    lower_m: tuple[Vec3, ...]  # one a box, local NED
+    upper_m: tuple[Vec3, ...]
+    goal_m: Vec3  # place to go to inside of the cell, or as near as it allows
+    land: bool = False  # whether to land there
+
+
+class CellDecision(Record, frozen=True, kw_only=True):
+    """Decision of a vehicle about a cell, or its exit from one."""
+
+    at_ns: int
+    number: int  # of the cell decided about; at an exit of the cell left
+    taken: bool  # whether the vehicle uses it from now on
+    exits: int  # times that the vehicle has left its cell
+
+
+class Conduct(StrEnum):
+    """How a vehicle of a fleet moves."""
+
+    CELL = "cell"  # by plans inside of its cell
+    REST = "rest"  # by plans at rest, without a cell: it takes one
+    PATH = "path"  # along the path that it reports: on the ground, or in its own climb or landing
+    FREE = "free"  # by a fallback, its pilot or a failsafe: it may go anywhere within its limits
+
+
+class CellReport(Record, frozen=True, kw_only=True):
+    """Report of a vehicle to the coordinator of the cells."""
+
+    step: int  # of the first row
+    path_m: tuple[Vec3, ...]  # positions of the plan in progress, one a step; it rests in the last one
+    margin_m: tuple[Vec3, ...]  # back-off of the limits of each position
+    velocity_mps: Vec3  # at the first row
+    goal_m: Vec3  # place that the mission, or the operator, wants the vehicle at
+    exits: int  # times that the vehicle has left its cell
+    in_use: int  # number of the cell in use; 0 without one
+    decided: int  # number of the newest cell that was taken or refused
+    conduct: Conduct
+    reach_mps2: Vec3  # largest acceleration of each axis, where it is free
+
+
 class StepInput(Record, frozen=True, kw_only=True):
     """Inputs of one control tick; recorded, and enough to replay the tick."""
 
@@ -272,6 +320,7 @@ class StepInput(Record, frozen=True, kw_only=True):
     # Time that a controller of another package took for its plan in the tick before [ns], as the flying process has
     # measured it; 0 where none was asked for, or time is virtual
     answered_ns: int = 0
+    cell: CellMessage | None = None  # newest moving cell since the tick before
 
     def with_measurements(self, other: StepInput) -> StepInput:
         """Return these inputs with the positions, the motion and the inertial data of another tick."""

@@ -492,6 +492,8 @@ def replay(
             for command in record.commands:
                 loop.order(command)
             loop.note_solve_time(record.answered_ns)
+            if record.cell is not None:
+                loop.put_cell(record.cell)
             inputs = loop.gather_inputs(record.tick, record.at_ns, record.missed_ticks, record.stop)
             loop.run_inputs(inputs.with_measurements(record) if moved_inputs else inputs, discard, core_error)
         elif isinstance(record, Datagram) and not record.outgoing:

@@ -25,6 +25,7 @@ from logs.recording.notes import RecorderNote
 from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.records import (
+    CellDecision,
     Checked,
     ClosestApproach,
     Collision,
@@ -102,6 +103,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/uavctl/step_input", StepInput, "all inputs of a tick; replay starts from here"),
     Topic("/uavctl/estimate", Estimate, "state estimate at `at_ns`; `captured_ns`: capture of its newest sample"),
     Topic("/uavctl/plan", Plan, "a new plan, one row a step Δt from `base_ns` on"),
+    Topic("/uavctl/cell", CellDecision, "decision about a moving cell, or the exit from one"),
     Topic("/uavctl/decision", Decision, "decision of a tick, and its reason"),
     Topic("/uavctl/setpoint", Setpoint, "acceleration setpoint after the setpoint limiter"),
     Topic("/uavctl/vehicle", VehicleStatus, "mode and state that the vehicle reports"),

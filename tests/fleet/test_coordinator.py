@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from uavctl.fleet.boxes import Boxes, find_gaps
-from uavctl.fleet.cell import CellChoice, Conduct, MovingCell, PlannedPath, Report, decide_cell
+from uavctl.fleet.cell import CellChoice, MovingCell, PlannedPath, Report, decide_cell
 from uavctl.fleet.coordinator import CellParameters, advance, begin, issue, receive
 from uavctl.fleet.voronoi import make_voronoi_cells
+from uavctl.records import Conduct
 
 STAGES = 8
 PARAMETERS = CellParameters(
@@ -29,6 +30,11 @@ def gather(cells: list[MovingCell], step: int) -> Boxes:
     index = [np.clip(np.arange(STAGES) + step - cell.step, 0, STAGES - 1) for cell in cells]
     pairs = list(zip(cells, index, strict=True))
     return Boxes(np.array([c.lower_m[i] for c, i in pairs]), np.array([c.upper_m[i] for c, i in pairs]))
+
+
+def get_cell(choice: CellChoice) -> MovingCell:
+    assert choice.cell is not None
+    return choice.cell
 
 
 def draw_plan(rng: np.random.Generator, cell: MovingCell, step: int) -> PlannedPath:
@@ -62,16 +68,18 @@ def test_cells_in_use_are_apart_for_any_fate_of_messages(loss: float, delay: int
                     inboxes[i].append((step + int(rng.integers(delay + 1)), cell))
         for i, choice in enumerate(choices):
             due = [cell for at, cell in inboxes[i] if at == step]
-            plan = draw_plan(rng, choice.cell, step) if rng.random() < 0.5 else state.reports[i].plan
+            plan = draw_plan(rng, get_cell(choice), step) if rng.random() < 0.5 else state.reports[i].plan
             for cell in due:
                 before, choice = choice, decide_cell(choice, cell, step, plan)
                 taken += choice.cell is not before.cell
                 refused += choice.decided != before.decided and choice.cell is before.cell
             choices[i] = choice
             if rng.random() >= loss:
-                report = Report(draw_plan(rng, choice.cell, step), np.zeros(3), choice.cell.number, choice.decided)
+                report = Report(
+                    draw_plan(rng, get_cell(choice), step), np.zeros(3), get_cell(choice).number, choice.decided
+                )
                 sent_reports.append((step + 1 + int(rng.integers(delay + 1)), i, report))
-        used = gather([choice.cell for choice in choices], step)
+        used = gather([get_cell(choice) for choice in choices], step)
         gaps = find_gaps(used, used, PARAMETERS.distance_m)[np.triu_indices(len(choices), 1)]
         assert gaps.min() >= 1.0 - 1e-9
         # The cell in use is inside of the claim: for these stages and for good
@@ -87,14 +95,14 @@ def test_a_plan_in_progress_is_inside_of_the_new_cell() -> None:
     state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
     choices = [CellChoice(cell, cell.number) for cell in state.newest]
     for step in range(60):
-        plans = [draw_plan(rng, choice.cell, step) for choice in choices]
+        plans = [draw_plan(rng, get_cell(choice), step) for choice in choices]
         reports = [
-            Report(plan, np.zeros(3), choice.cell.number, choice.decided)
+            Report(plan, np.zeros(3), get_cell(choice).number, choice.decided)
             for plan, choice in zip(plans, choices, strict=True)
         ]
         state = issue(receive(advance(state, step), dict(enumerate(reports))), PARAMETERS)
         for i, (plan, cell) in enumerate(zip(plans, state.newest, strict=True)):
-            assert cell.number == choices[i].cell.number + 1
+            assert cell.number == get_cell(choices[i]).number + 1
             for later in (step, step + 1, step + 5):
                 assert cell.compute_excess_m(later, plan).max() <= 1e-9
             choices[i] = decide_cell(choices[i], cell, step, plan)

@@ -6,8 +6,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from uavctl.fleet.cell import CellChoice, Conduct, MovingCell
+from uavctl.fleet.cell import CellChoice, MovingCell
 from uavctl.lab.swaps import SwapCase, SwapWorld, build_swap_design, fly_swap, make_circle, measure_distances
+from uavctl.records import Conduct
 from uavctl.smpc.conditioned.design import ConditionedDesign
 
 MAX_RISK = 0.05  # 1 - δ_x of preset `room`
@@ -82,10 +83,10 @@ def test_vehicles_hold_in_their_last_cells_when_the_coordinator_stops() -> None:
         before_m = world.positions_m
         world.advance()
         assert (measure_distances(before_m, world.positions_m, world.case.distance_m) >= 0.6).all()
-    cells = [vehicle.choice.cell for vehicle in world.vehicles]
+    cells = [vehicle.cell for vehicle in world.vehicles]
     for _ in range(50):
         world.advance()
-    assert all(vehicle.choice.cell is cell for vehicle, cell in zip(world.vehicles, cells, strict=True))
+    assert all(vehicle.cell is cell for vehicle, cell in zip(world.vehicles, cells, strict=True))
     last_m = np.array([cell.lower_m[-1] for cell in cells]), np.array([cell.upper_m[-1] for cell in cells])
     # Inside of the last box, but for the risk of a moment
     assert (np.maximum(last_m[0] - world.positions_m, world.positions_m - last_m[1]) < 0.1).all()

@@ -73,6 +73,7 @@ class MissionConfig(Section, frozen=True, kw_only=True):
     yaw_deg: Annotated[Annotated[float, Meta(ge=-180, le=180)] | None, declare("clockwise from north", "deg")] = None
     yaw_rate_dps: Annotated[float, declare("fastest turn; ArduPilot's own limit is 60", "deg/s", 1, 360)] = 60.0
     trajectory: TrajectoryConfig = TrajectoryConfig()
+    cells: Annotated[bool, declare("fly in the moving cells of a fleet's coordinator only; see `uavctl fleet`")] = False
 
 
 class FenceConfig(Section, frozen=True, kw_only=True):

@@ -5,18 +5,23 @@
 2. It takes a new cell only if its plan in progress keeps it as well as the old one, or a new plan does. So the next
    program has that plan as a solution.
 3. It reports the number in use and the last number decided. Without a new cell it stays in the one in use for good.
+4. A vehicle that no longer flies by plans leaves its cell. It counts its exits, and takes no cell that was issued
+   before the last one.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import numpy as np
 
 from uavctl.arrays import Array
+from uavctl.records import CellMessage, CellReport, Conduct, Vec3
 
 KEPT_TOLERANCE_M = 1e-6  # excess of a plan over a cell that is rounding of its program
+STEP_TOLERANCE = 1e-6  # part of a step that is rounding of a time
+NO_CELL = 0  # number without a cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +34,19 @@ class MovingCell:
     upper_m: Array  # (S, 3)
     goal_m: Array  # place to go to inside of the cell, or as near as it allows (3,)
     land: bool = False  # whether to land
+    exits: int = 0  # times that the vehicle had left its cell when this one was issued
 
-    def find_limits(self, step: int, stages: int) -> tuple[Array, Array]:
+    def find_limits(self, step: float, stages: int) -> tuple[Array, Array]:
         """Find the limits (n, 3) in stages 1 … n of a plan from a step: in stage t both boxes that meet there hold.
 
-        A motion along a line between two steps then stays inside the box between them.
+        A motion along a line between two stages then stays inside the box between them. Between two steps there are
+        three boxes: those that hold at some time within a step from the stage.
         """
-        index = np.clip(step - self.step + np.arange(stages + 1), 0, len(self.lower_m) - 1)
-        lower_m, upper_m = self.lower_m[index], self.upper_m[index]
-        return np.maximum(lower_m[:-1], lower_m[1:]), np.minimum(upper_m[:-1], upper_m[1:])
+        first = math.floor(step - self.step + STEP_TOLERANCE)
+        boxes_per_stage = 2 if step - self.step - first <= STEP_TOLERANCE else 3
+        index = first + np.arange(stages)[:, None] + np.arange(boxes_per_stage)
+        index = np.clip(index, 0, len(self.lower_m) - 1)
+        return self.lower_m[index].max(axis=1), self.upper_m[index].min(axis=1)
 
     def compute_excess_m(self, step: int, plan: PlannedPath) -> Array:
         """Compute how far a plan with its margins is outside in stages 1 … H, (H, 3) [m]; 0 is inside."""
@@ -61,42 +70,132 @@ class PlannedPath:
         return PlannedPath(step, self.mean_m[index], self.margin_m[index])
 
 
-class Conduct(Enum):
-    """How a vehicle moves."""
-
-    CELL = "cell"  # inside of its cell
-    FREE = "free"  # released, blind or flown by its pilot
-
-
 @dataclass(frozen=True, eq=False)
 class Report:
     """Report of a vehicle to the coordinator."""
 
     plan: PlannedPath  # plan in progress, from the step of the report on; its first row is the position
     velocity_mps: Array  # at the first row (3,)
-    in_use: int  # number of the cell in use
+    in_use: int  # number of the cell in use; `NO_CELL` without one
     decided: int  # number of the newest cell that was taken or refused
     conduct: Conduct = Conduct.CELL
+    exits: int = 0  # times that the vehicle has left its cell
+    goal_m: Array | None = None  # place that it is to reach (3,); None: as before
+    reach_mps2: Array | None = None  # largest acceleration of each axis where it is free (3,); None: its limits
 
     @property
-    def order(self) -> tuple[int, int]:
+    def order(self) -> tuple[int, int, int]:
         """What a newer report of the vehicle has more of."""
-        return self.plan.step, self.decided
+        return self.plan.step, self.exits, self.decided
 
 
 @dataclass(frozen=True, eq=False)
 class CellChoice:
     """Cell in use, and the last number decided."""
 
-    cell: MovingCell
+    cell: MovingCell | None  # None without one
     decided: int
+    exits: int = 0  # times that the vehicle has left its cell
+
+
+NO_CHOICE = CellChoice(None, NO_CELL)
+
+
+def is_open(choice: CellChoice, new: MovingCell) -> bool:
+    """Whether a cell is still to be decided about."""
+    return new.number > choice.decided and new.exits == choice.exits
 
 
 def decide_cell(choice: CellChoice, new: MovingCell, step: int, plan: PlannedPath) -> CellChoice:
     """Take or refuse a new cell at a step, by the plan in progress or by a new one."""
-    if new.number <= choice.decided:
+    if not is_open(choice, new):
         return choice
-    allowed_m = choice.cell.compute_excess_m(step, plan) + KEPT_TOLERANCE_M
+    allowed_m: Array | float = KEPT_TOLERANCE_M
+    if choice.cell is not None:
+        allowed_m = choice.cell.compute_excess_m(step, plan) + KEPT_TOLERANCE_M
     if (new.compute_excess_m(step, plan) <= allowed_m).all():
-        return CellChoice(new, new.number)
+        return replace(choice, cell=new, decided=new.number)
     return replace(choice, decided=new.number)
+
+
+def leave_cell(choice: CellChoice) -> CellChoice:
+    """Leave the cell in use, if there is one; cells issued before are void."""
+    return choice if choice.cell is None else replace(choice, cell=None, exits=choice.exits + 1)
+
+
+def format_cell(cell: MovingCell) -> CellMessage:
+    """Return a cell as a message."""
+    return CellMessage(
+        exits=cell.exits,
+        number=cell.number,
+        step=cell.step,
+        lower_m=_format_rows(cell.lower_m),
+        upper_m=_format_rows(cell.upper_m),
+        goal_m=_format_row(cell.goal_m),
+        land=cell.land,
+    )
+
+
+def parse_cell(message: CellMessage) -> MovingCell:
+    """Return the cell of a message.
+
+    Raises:
+        ValueError: It has no box, sides of different length, or a number that is not finite.
+    """
+    lower_m, upper_m, goal_m = np.array(message.lower_m), np.array(message.upper_m), np.array(message.goal_m)
+    if not len(lower_m) or lower_m.shape != upper_m.shape:
+        raise ValueError(f"a cell of {len(lower_m)} lower and {len(upper_m)} upper sides is none")
+    if not (np.isfinite(lower_m).all() and np.isfinite(upper_m).all() and np.isfinite(goal_m).all()):
+        raise ValueError("a cell has sides or a goal that are not finite")
+    return MovingCell(message.number, message.step, lower_m, upper_m, goal_m, message.land, message.exits)
+
+
+def parse_report(message: CellReport) -> Report:
+    """Return the report of a message.
+
+    Raises:
+        ValueError: Its path has no row, another number of margins, or a number that is not finite.
+    """
+    mean_m, margin_m = np.array(message.path_m), np.array(message.margin_m)
+    others = np.array((message.velocity_mps, message.goal_m, message.reach_mps2))
+    if not len(mean_m) or mean_m.shape != margin_m.shape:
+        raise ValueError(f"a path of {len(mean_m)} positions and {len(margin_m)} margins is none")
+    if not (np.isfinite(mean_m).all() and np.isfinite(margin_m).all() and np.isfinite(others).all()):
+        raise ValueError("a report has numbers that are not finite")
+    return Report(
+        PlannedPath(message.step, mean_m, margin_m),
+        velocity_mps=others[0],
+        in_use=message.in_use,
+        decided=message.decided,
+        conduct=message.conduct,
+        exits=message.exits,
+        goal_m=others[1],
+        reach_mps2=others[2],
+    )
+
+
+def format_report(report: Report) -> CellReport:
+    """Return a report as a message."""
+    assert report.goal_m is not None
+    assert report.reach_mps2 is not None
+    return CellReport(
+        step=report.plan.step,
+        path_m=_format_rows(report.plan.mean_m),
+        margin_m=_format_rows(report.plan.margin_m),
+        velocity_mps=_format_row(report.velocity_mps),
+        goal_m=_format_row(report.goal_m),
+        exits=report.exits,
+        in_use=report.in_use,
+        decided=report.decided,
+        conduct=report.conduct,
+        reach_mps2=_format_row(report.reach_mps2),
+    )
+
+
+def _format_rows(rows: Array) -> tuple[Vec3, ...]:
+    return tuple(_format_row(row) for row in rows)
+
+
+def _format_row(row: Array) -> Vec3:
+    north, east, down = row.tolist()
+    return north, east, down

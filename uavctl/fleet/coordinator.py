@@ -9,8 +9,9 @@ it. Cells and reports may be lost, late, repeated or out of order.
 3. A new cell is the plan in progress with its margins, extended towards the goal as far as the vehicle can fly, and
    cut by the planes. Planes are outside of the claim, so they never cut the plan.
 4. Claims of all vehicles stay apart: a new cell is apart from the new cells and from the claims of all others.
-5. A vehicle that keeps to no cell is an obstacle that grows. Cells avoid it. A vehicle whose plan may meet it is told
-   to land.
+5. A vehicle that is free is an obstacle that grows. Cells avoid it. A vehicle whose plan may meet it is told to land.
+6. A vehicle without a cell, at rest or in its own climb or landing, claims the path that it reports if that is apart
+   from all other claims; else it is an obstacle there. Once it flies by plans it gets a cell around its path.
 """
 
 from __future__ import annotations
@@ -21,13 +22,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uavctl.arrays import Array, Flags
-from uavctl.fleet.boxes import Bounds, Boxes, divide_pairs, find_gaps, get_axis_distances_m
-from uavctl.fleet.cell import Conduct, MovingCell, PlannedPath, Report
+from uavctl.fleet.boxes import ROUNDING_M, Bounds, Boxes, divide_pairs, find_gaps, get_axis_distances_m
+from uavctl.fleet.cell import NO_CELL, MovingCell, PlannedPath, Report
 from uavctl.fleet.obstacles import find_reach
 from uavctl.fleet.right_of_way import Ways, choose_guides
+from uavctl.records import Conduct
 
 START_NUMBER = 0  # number of the cell in which a vehicle begins
 LANDING_WAY_M = 1.2  # way to the side on which a vehicle lands beside an obstacle's way
+GRID_M = 1e-4  # sides of cells are multiples of it: short as text, and far below all margins
+GRID_TOLERANCE = 1e-6  # part of it that is rounding
 MIN_SPEED_MPS, MIN_WAY_M = 0.1, 0.01  # an obstacle that is slower stands; a vehicle that is nearer has no side
 
 
@@ -61,6 +65,7 @@ class CoordinatorState:
     previous: tuple[MovingCell, ...]  # the one before; a cell to land in is issued before it is decided
     reports: tuple[Report, ...]  # newest report of each vehicle
     goals_m: Array  # place that each vehicle is to reach (N, 3)
+    exits: tuple[int, ...]  # times that each vehicle has left its cell
 
     @property
     def claims(self) -> Boxes:
@@ -104,7 +109,37 @@ def begin(step: int, positions_m: Array, goals_m: Array, parameters: CellParamet
         previous=cells,
         reports=tuple(Report(plan, np.zeros(3), START_NUMBER, START_NUMBER) for plan in rest),
         goals_m=goals_m,
+        exits=(0,) * len(positions_m),
     )
+
+
+def begin_without_cells(step: int, reports: Sequence[Report], parameters: CellParameters) -> CoordinatorState:
+    """Begin with a report of each vehicle, none of which has a cell yet."""
+    count, stages = len(reports), parameters.stages
+    positions_m = [report.plan.mean_m[0] for report in reports]
+    cells = [
+        MovingCell(
+            report.decided,
+            step,
+            np.tile(place_m, (stages, 1)),
+            np.tile(place_m, (stages, 1)),
+            place_m,
+            exits=report.exits,
+        )
+        for report, place_m in zip(reports, positions_m, strict=True)
+    ]
+    state = CoordinatorState(
+        step=step,
+        used=Boxes.make_empty(count, stages),
+        used_numbers=(NO_CELL,) * count,
+        pending=Boxes.make_empty(count, stages),
+        newest=tuple(cells),
+        previous=tuple(cells),
+        reports=tuple(reports),
+        goals_m=np.array(positions_m),
+        exits=tuple(report.exits for report in reports),
+    )
+    return replace(state, goals_m=_take_goals(state))
 
 
 def advance(state: CoordinatorState, step: int) -> CoordinatorState:
@@ -115,54 +150,73 @@ def advance(state: CoordinatorState, step: int) -> CoordinatorState:
 
 def receive(state: CoordinatorState, reports: Mapping[int, Report]) -> CoordinatorState:
     """Take up reports by the number of the vehicle; older ones than the newest known change nothing."""
-    newest, numbers, in_use = list(state.reports), list(state.used_numbers), list(state.newest)
-    is_taken, is_decided = np.zeros(len(newest), dtype=bool), np.zeros(len(newest), dtype=bool)
+    newest, numbers, in_use, exits = list(state.reports), list(state.used_numbers), list(state.newest), [*state.exits]
+    is_taken, is_decided, has_left = (np.zeros(len(newest), dtype=bool) for _ in range(3))
     for i, report in reports.items():
         if report.order < newest[i].order:
             continue
         newest[i] = report
+        if report.exits > exits[i]:
+            has_left[i], exits[i], numbers[i] = True, report.exits, NO_CELL
         for cell in (state.previous[i], state.newest[i]):
-            if report.in_use == cell.number != numbers[i]:
+            if report.in_use == cell.number != numbers[i] and report.exits == cell.exits:
                 is_taken[i], in_use[i], numbers[i] = True, cell, cell.number
         is_decided[i] = report.decided >= state.newest[i].number and report.in_use == numbers[i]
-    pending = Boxes.make_empty(*state.used.lower_m.shape[:2]).take(is_decided, state.pending)
-    used = _gather_boxes(in_use, state.step).take(is_taken, state.used)
-    return replace(state, used=used, pending=pending, used_numbers=tuple(numbers), reports=tuple(newest))
+    empty = Boxes.make_empty(*state.used.lower_m.shape[:2])
+    pending = empty.take(is_decided | has_left, state.pending)
+    used = _gather_boxes(in_use, state.step).take(is_taken, empty.take(has_left, state.used))
+    state = replace(
+        state, used=used, pending=pending, used_numbers=tuple(numbers), reports=tuple(newest), exits=tuple(exits)
+    )
+    return replace(state, goals_m=_take_goals(state))
+
+
+def _take_goals(state: CoordinatorState) -> Array:
+    """Return the goals of the newest reports (N, 3); as before where one names none."""
+    rows = [
+        known_m if report.goal_m is None else report.goal_m
+        for report, known_m in zip(state.reports, state.goals_m, strict=True)
+    ]
+    return np.array(rows)
 
 
 def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorState:
     """Issue new cells where the newest ones are decided; `state.newest` is what to send."""
     step = state.step
-    is_free = np.array(
-        [
-            report.conduct is Conduct.FREE or (step - report.plan.step) * parameters.dt_s > parameters.silence_s
-            for report in state.reports
-        ],
-        dtype=bool,
+    is_silent = np.array(
+        [(step - report.plan.step) * parameters.dt_s > parameters.silence_s for report in state.reports], dtype=bool
     )
+    is_free = np.array([report.conduct is Conduct.FREE for report in state.reports], dtype=bool)
     positions_m, plans = _gather_plans(state, parameters)
-    claims = Boxes.make_empty(*plans.lower_m.shape[:2]).take(is_free, state.claims)
+    claims, is_blocked = _gather_claims(state, plans, is_free, is_silent, parameters)
     bounds = divide_pairs(claims, plans, parameters.distance_m)
-    away, must_land = _avoid_obstacles(state, is_free, plans, parameters)
+    is_growing = is_free | is_silent
+    away, must_land = _avoid_obstacles(state, is_growing, is_blocked, plans, parameters)
     guides_m = choose_guides(
         positions_m,
         state.goals_m,
         Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m),
     )
-    guides_m = np.where(must_land[:, None], _find_landing_places(state, is_free, positions_m, parameters), guides_m)
+    landing_places_m = _find_landing_places(state, is_growing | is_blocked, positions_m, parameters)
+    guides_m = np.where(must_land[:, None], landing_places_m, guides_m)
     wanted = _extend(plans, guides_m, parameters)
     lower_m = np.maximum(wanted.lower_m, bounds.lower_m)
     upper_m = np.minimum(wanted.upper_m, bounds.upper_m)
     # Away from obstacles, but never so far that the plan in progress is cut
     lower_m = np.maximum(lower_m, np.minimum(away.lower_m, plans.lower_m))
     upper_m = np.minimum(upper_m, np.maximum(away.upper_m, plans.upper_m))
+    cells = Boxes(
+        np.ceil(lower_m / GRID_M - GRID_TOLERANCE) * GRID_M, np.floor(upper_m / GRID_M + GRID_TOLERANCE) * GRID_M
+    )
     # A vehicle that must land has its first such cell at once
     is_told = np.array([cell.land for cell in state.newest], dtype=bool)
-    is_new = ~is_free & bounds.is_divided & (state.is_decided | (must_land & ~is_told))
-    cells = Boxes(lower_m, upper_m)
-    is_new &= ~cells.is_empty
+    takes_cells = np.array([report.conduct in (Conduct.CELL, Conduct.REST) for report in state.reports], dtype=bool)
+    is_new = takes_cells & ~is_silent & ~is_blocked & bounds.is_divided & ~cells.is_empty
+    is_new &= state.is_decided | (must_land & ~is_told)
     newest = tuple(
-        MovingCell(cell.number + 1, step, lower_m[i], upper_m[i], guides_m[i], bool(must_land[i]))
+        MovingCell(
+            cell.number + 1, step, cells.lower_m[i], cells.upper_m[i], guides_m[i], bool(must_land[i]), state.exits[i]
+        )
         if is_new[i]
         else cell
         for i, cell in enumerate(state.newest)
@@ -170,6 +224,26 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     previous = tuple(state.newest[i] if is_new[i] else cell for i, cell in enumerate(state.previous))
     pending = state.pending.cover(cells).take(is_new, state.pending)
     return replace(state, pending=pending, newest=newest, previous=previous)
+
+
+def _gather_claims(
+    state: CoordinatorState, plans: Boxes, is_free: Flags, is_silent: Flags, parameters: CellParameters
+) -> tuple[Boxes, Flags]:
+    """Gather the claims, and find the vehicles whose path is too near to another one's claim (N,).
+
+    A free vehicle has only the cells that it may still take. One without a cell claims its path, if nobody is there.
+    """
+    claims = state.pending.take(is_free, state.claims)
+    is_path = state.used.is_empty & ~is_free & ~is_silent
+    is_blocked = np.zeros(len(is_free), dtype=bool)
+    for i in np.flatnonzero(is_path):
+        only = np.arange(len(is_free)) == i
+        path = plans.take(only, Boxes.make_empty(*plans.lower_m.shape[:2]))
+        near = find_gaps(Boxes(path.lower_m[only], path.upper_m[only]), claims, parameters.distance_m)[0]
+        is_blocked[i] = bool((near[~only] < 1.0 - ROUNDING_M).any())
+        if not is_blocked[i]:
+            claims = claims.cover(path)
+    return claims, is_blocked
 
 
 def _gather_boxes(cells: Sequence[MovingCell], step: int) -> Boxes:
@@ -183,7 +257,7 @@ def _gather_boxes(cells: Sequence[MovingCell], step: int) -> Boxes:
 
 
 def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[Array, Boxes]:
-    """Gather the positions (N, 3), and the boxes of the plans in progress with margins, inside of the cells in use.
+    """Gather the positions (N, 3), and the boxes of the plans in progress with margins, inside of cells in use.
 
     Box s contains the mean of stages s and s + 1.
     """
@@ -192,7 +266,7 @@ def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[
     lower_m, upper_m = mean_m - margin_m - parameters.margin_m, mean_m + margin_m + parameters.margin_m
     later = np.minimum(np.arange(parameters.stages) + 1, parameters.stages - 1)
     boxes = Boxes(np.minimum(lower_m, lower_m[:, later]), np.maximum(upper_m, upper_m[:, later]))
-    return mean_m[:, 0], boxes.clip_to(state.used)
+    return mean_m[:, 0], boxes.take(state.used.is_empty, boxes.clip_to(state.used))
 
 
 def _extend(plans: Boxes, guides_m: Array, parameters: CellParameters) -> Boxes:
@@ -211,40 +285,47 @@ def _extend(plans: Boxes, guides_m: Array, parameters: CellParameters) -> Boxes:
 
 
 def _avoid_obstacles(
-    state: CoordinatorState, is_free: Flags, plans: Boxes, parameters: CellParameters
+    state: CoordinatorState, is_growing: Flags, is_blocked: Flags, plans: Boxes, parameters: CellParameters
 ) -> tuple[Bounds, Flags]:
     """Return the sides of the planes beside obstacles, and whether a vehicle's plan may meet one (N,)."""
     needed = get_axis_distances_m(parameters.distance_m)
     lower_m, upper_m = np.full(plans.lower_m.shape, -np.inf), np.full(plans.upper_m.shape, np.inf)
-    must_land = np.zeros(len(is_free), dtype=bool)
-    for i in np.flatnonzero(is_free):
-        report = state.reports[i]
-        times_s = np.arange(parameters.stages + 1, dtype=np.float64)
-        times_s = parameters.dt_s * (times_s + (state.step - report.plan.step))
-        reach_lower_m, reach_upper_m = find_reach(
-            report.plan.mean_m[0], report.velocity_mps, parameters.accel_mps2, parameters.speed_mps, times_s
-        )
-        # Box s: from stage s to s + 1
-        low_m = np.minimum(reach_lower_m[:-1], reach_lower_m[1:]) - parameters.margin_m - needed
-        high_m = np.maximum(reach_upper_m[:-1], reach_upper_m[1:]) + parameters.margin_m + needed
+    must_land = np.zeros(len(is_growing), dtype=bool)
+    for i in np.flatnonzero(is_growing | is_blocked):
+        box = _find_reach_boxes(state, i, parameters) if is_growing[i] else (plans.lower_m[i], plans.upper_m[i])
+        low_m, high_m = box[0] - needed, box[1] + needed
         gap = np.concatenate([low_m - plans.upper_m, plans.lower_m - high_m], axis=2) / np.tile(needed, 2)
         choice = gap.argmax(axis=2)
-        must_land |= (gap.max(axis=2) < 0.0).any(axis=1)
+        must_land |= (gap.max(axis=2) < 0.0).any(axis=1) & (np.arange(len(must_land)) != i)
         vehicle, stage = np.nonzero(np.ones(choice.shape, dtype=bool))
         axis, is_below = choice.ravel() % 3, choice.ravel() < 3
         at = vehicle, stage, axis
         np.minimum.at(upper_m, at, np.where(is_below, low_m[stage, axis], np.inf))
         np.maximum.at(lower_m, at, np.where(is_below, -np.inf, high_m[stage, axis]))
-    must_land &= ~is_free
+    must_land &= ~is_growing
     return Bounds(lower_m, upper_m, ~must_land), must_land
 
 
+def _find_reach_boxes(state: CoordinatorState, i: np.intp, parameters: CellParameters) -> tuple[Array, Array]:
+    """Find the boxes (S, 3), (S, 3) of a free vehicle: all that it can reach, with a margin."""
+    report = state.reports[i]
+    times_s = np.arange(parameters.stages + 1, dtype=np.float64)
+    times_s = parameters.dt_s * (times_s + (state.step - report.plan.step))
+    accel_mps2 = parameters.accel_mps2 if report.reach_mps2 is None else report.reach_mps2
+    lower_m, upper_m = find_reach(report.plan.mean_m[0], report.velocity_mps, accel_mps2, parameters.speed_mps, times_s)
+    # Box s: from stage s to s + 1
+    return (
+        np.minimum(lower_m[:-1], lower_m[1:]) - parameters.margin_m,
+        np.maximum(upper_m[:-1], upper_m[1:]) + parameters.margin_m,
+    )
+
+
 def _find_landing_places(
-    state: CoordinatorState, is_free: Flags, positions_m: Array, parameters: CellParameters
+    state: CoordinatorState, is_obstacle: Flags, positions_m: Array, parameters: CellParameters
 ) -> Array:
     """Find places (N, 3) on the floor, beside the ways of the obstacles."""
     places_m = positions_m.copy()
-    for i in np.flatnonzero(is_free):
+    for i in np.flatnonzero(is_obstacle):
         report = state.reports[i]
         offsets_m, way_mps = (positions_m - report.plan.mean_m[0])[:, :2], report.velocity_mps[:2]
         # Place of the way that is nearest to each vehicle: t = o'v / v'v

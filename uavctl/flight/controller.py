@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from uavctl.arrays import Array
 from uavctl.constraint_names import ConstraintNames
+from uavctl.flight.cells import CellRows
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import LimitsParameters
@@ -50,6 +51,7 @@ class Controller:
     yaw: YawParameters = HELD_YAW  # parameters of the yaw setpoint
     risk: RiskParameters | None = None  # parameters of the risk; None: the design's budgets fly
     envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: no monitor of motion runs
+    cell_rows: CellRows | None = None  # limits of the positions, for moving cells; None: the vehicle flies in none
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others
     reach: Reach = field(init=False, repr=False)  # reachable set of the vehicle, made from the others

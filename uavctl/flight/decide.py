@@ -20,7 +20,18 @@ import numpy as np
 from msgspec.structs import replace
 
 from uavctl.arrays import Array
+from uavctl.fleet.cell import MovingCell, PlannedPath, parse_cell
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias, remove_drag_from_bias
+from uavctl.flight.cells import (
+    CellGroup,
+    add_cell,
+    choose_cell,
+    is_at_landing_place,
+    leave_cells,
+    limit_preview,
+    locate_plan,
+    refuse_cell,
+)
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.controller import Controller
 from uavctl.flight.estimator import make_estimate, select_covariance
@@ -40,7 +51,7 @@ from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, jud
 from uavctl.flight.monitors.velocity import CORRECTS_NS
 from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.risk import set_risk
-from uavctl.flight.solve import ask_solver
+from uavctl.flight.solve import SolveOutcome, ask_solver
 from uavctl.flight.state import ControlState, find_mode
 from uavctl.flight.supervise import RETURNED_NS, Supervised, are_positions_lost, observe_velocity
 from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
@@ -61,6 +72,7 @@ AFTER_HOLD_NS, AFTER_HOLD_MPS2 = 1_500_000_000, 0.7
 # show that they err. With five positions a second and 60 % of them lost, one in ten is older.
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
+BESIDE_OBSTACLE = "a vehicle that is free may come near: landing is asked for"
 _FINAL_TEXTS = {
     FallbackReason.VELOCITY_WRONG: "the vehicle's own velocity was found wrong or has stopped, and nothing replaces it",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
@@ -85,6 +97,7 @@ class Decided(msgspec.Struct, frozen=True, eq=False):
     biases: Biases
     jump_suspected: bool
     fault: str  # why a controller of another package is given up; empty as long as it is not
+    cells: CellGroup  # moving cells
     reason: str = ""
     new_measurement: bool = False  # whether a new position was there at the boundary
     solve: SolveStatus | None = None  # outcome of the solve; None if none was asked
@@ -123,7 +136,10 @@ def decide(state: ControlState, context: TickContext, supervised: Supervised, or
     """Decide the mode: wait, plan, or fallback."""
     phase = _Phase(state, context, supervised)
     draft = _apply_requests(phase, ordered)
-    return _decide_handed_over(draft, phase) or _decide_fallback(draft, phase) or _decide_plan(draft, phase)
+    decided = _decide_handed_over(draft, phase) or _decide_fallback(draft, phase) or _decide_plan(draft, phase)
+    if context.controller.cell_rows is not None and decided.mode is not ControlMode.TRACK:
+        return replace(decided, cells=leave_cells(decided.cells))
+    return decided
 
 
 def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
@@ -140,6 +156,9 @@ def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
     jump_suspected = state.fallback.jump_suspected or (becomes_final and outliers is not None and outliers.is_likely)
     if phase.context.inputs.stop:
         fallback = request_fallback(fallback, FallbackReason.STOP, at_ns)
+    cells, message = state.cells, phase.context.inputs.cell
+    if message is not None and phase.controller.cell_rows is not None:
+        cells = add_cell(cells, parse_cell(message))
     return Decided(
         plan=state.plan.flown,
         superseded_after_ns=_find_superseded_after_ns(state, supervised),
@@ -152,6 +171,7 @@ def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
         biases=_update_biases(phase),
         jump_suspected=is_final and jump_suspected,
         fault=supervised.monitors.external.fault,
+        cells=cells,
     )
 
 
@@ -259,6 +279,9 @@ def _plan_from(draft: Decided, belief: Belief, phase: _Phase) -> Decided:
     if controller.mission.land and draft.order is None and is_over(controller.mission, mission, context.boundary_ns):
         landing = request_fallback(draft.fallback, FallbackReason.LAND, context.at_ns)
         return _fall_back(draft, landing, phase, MISSION_OVER)
+    if is_at_landing_place(draft.cells, read_position(base, controller.plant)):
+        landing = request_fallback(draft.fallback, FallbackReason.LAND, context.at_ns)
+        return _fall_back(draft, landing, phase, BESIDE_OBSTACLE)
     if not draft.fault and not supervised.wall.is_none:
         draft = replace(draft, fault=supervised.wall.text)
     if draft.fault:  # found just now, or the vehicle is flown again after the pilot had it
@@ -276,9 +299,16 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     controller, context = phase.controller, phase.context
     before_ns = None if draft.plan is None else draft.superseded_after_ns
     new_measurement = before_ns is None or base.captured_ns > before_ns
-    if not new_measurement and not _has_new_inertial(draft.plan, phase):
+    before_cells = draft.cells
+    draft = _choose_cell_by_plan(draft, phase)
+    if new_measurement:
+        reason = "news: a new plan"
+    elif _has_new_inertial(draft.plan, phase):
+        reason = "inertial data: a new plan"
+    elif draft.cells is not before_cells or draft.cells.pending is not None:
+        reason = "a new cell: a new plan"
+    else:
         return replace(draft, reason="no news: the plan plays out")
-    reason = "news: a new plan" if new_measurement else "inertial data: a new plan"
     if draft.order is not None:
         reason = f"{reason}, as ordered: {describe_order(draft.order)}"
     mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
@@ -289,8 +319,10 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     is_first = is_led(controller.mission, mission, context.boundary_ns)
     preview = set_risk(preview, phase.state.risk, controller.risk, is_led=is_first)
     preview = _complete_preview(preview, base, cov, draft, phase)
-    shape = (controller.horizon, controller.plant.n_u)
-    asked = ask_solver(controller.solver, context.step, base, target, preview, shape, controller.design_id)
+    if controller.cell_rows is None:
+        asked = _ask(base, target, preview, phase)
+    else:
+        draft, asked = _plan_in_cell(draft, base, preview, phase)
     draft = replace(draft, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
     if asked.plan is None:
         reason = "no new plan: the old one plays out"
@@ -303,6 +335,57 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
         new_plan=asked.plan,
         reason=reason,
     )
+
+
+def _ask(base: Estimate, target: Array, preview: Preview, phase: _Phase) -> SolveOutcome:
+    """Ask the solver for a plan."""
+    controller = phase.controller
+    shape = (controller.horizon, controller.plant.n_u)
+    return ask_solver(controller.solver, phase.context.step, base, target, preview, shape, controller.design_id)
+
+
+def _choose_cell_by_plan(draft: Decided, phase: _Phase) -> Decided:
+    """Take the cell that waits if the plan in progress keeps it."""
+    if draft.cells.pending is None or draft.plan is None or phase.controller.cell_rows is None:
+        return draft
+    return replace(draft, cells=choose_cell(draft.cells, _locate(draft.plan, phase)))
+
+
+def _locate(plan: Plan, phase: _Phase) -> PlannedPath:
+    """Locate a plan at the steps of the common clock, from this boundary on."""
+    controller, rows = phase.controller, phase.controller.cell_rows
+    assert rows is not None
+    position_m = read_position(phase.view.estimate, controller.plant)
+    return locate_plan(plan, rows, phase.context.boundary_ns, controller.dt_ns, position_m)
+
+
+def _plan_in_cell(draft: Decided, base: Estimate, preview: Preview, phase: _Phase) -> tuple[Decided, SolveOutcome]:
+    """Plan inside of the cell that waits, and take it if the plan keeps it; else inside of the one in use."""
+    pending = draft.cells.pending
+    if pending is not None:
+        asked = _ask_in_cell(pending, base, preview, phase)
+        cells = draft.cells if asked.plan is None else choose_cell(draft.cells, _locate(asked.plan, phase))
+        if cells is not draft.cells:
+            return replace(draft, cells=cells), asked
+        draft = replace(draft, cells=refuse_cell(draft.cells))
+    if draft.cells.choice.cell is not None:
+        return draft, _ask_in_cell(draft.cells.choice.cell, base, preview, phase)
+    region, rest = phase.controller.mission.rest_region, draft.cells.rest
+    if rest is None:
+        rest = base.mean if region is None else region.find_stop(base.mean)
+    preview = msgspec.structs.replace(preview, path=None)
+    return replace(draft, cells=replace(draft.cells, rest=rest)), _ask(base, np.array(rest), preview, phase)
+
+
+def _ask_in_cell(cell: MovingCell, base: Estimate, preview: Preview, phase: _Phase) -> SolveOutcome:
+    """Ask the solver for a plan inside of a cell, to its goal."""
+    controller, rows = phase.controller, phase.controller.cell_rows
+    assert rows is not None
+    north, east, down = cell.goal_m.tolist()
+    target = controller.plant.equilibrium((north, east, down))
+    limits, horizon = controller.mission.limits, controller.horizon
+    bounded = limit_preview(preview, cell, rows, limits, base.at_ns, controller.dt_ns, horizon)
+    return _ask(base, target, bounded, phase)
 
 
 def _complete_preview(preview: Preview, base: Estimate, cov: Array, draft: Decided, phase: _Phase) -> Preview:

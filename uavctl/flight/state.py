@@ -6,6 +6,7 @@ import msgspec
 
 from uavctl.arrays import Array
 from uavctl.flight.bias import Biases
+from uavctl.flight.cells import NO_CELLS, CellGroup
 from uavctl.flight.estimator import FilterHistory, PendingInputs
 from uavctl.flight.fallback import Fallback
 from uavctl.flight.limits import ZERO
@@ -120,6 +121,7 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     fallback: FallbackGroup = FallbackGroup()
     alarms: AlarmGroup = AlarmGroup()
     risk: RiskGroup = RiskGroup()
+    cells: CellGroup = NO_CELLS
 
     @property
     def mode(self) -> ControlMode:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import msgspec
 
 from uavctl.flight.act import Acted, act
+from uavctl.flight.cells import describe_decision
 from uavctl.flight.context import TickContext, locate_on_grid
 from uavctl.flight.controller import Controller
 from uavctl.flight.decide import Decided, decide
@@ -25,6 +26,7 @@ from uavctl.flight.orders import take_orders
 from uavctl.flight.state import ControlState, EstimatorGroup, FallbackGroup, MissionGroup, PlanGroup
 from uavctl.flight.supervise import Supervised, supervise
 from uavctl.records import (
+    CellDecision,
     ControlMode,
     Decision,
     Estimate,
@@ -51,6 +53,7 @@ class TickOutput(msgspec.Struct, frozen=True):
     # Why a vehicle in the air that others fly must not climb on by its positions; empty if it may
     unsafe_to_climb: str = ""
     position_inconsistent: bool = False  # that is because positions cannot be its own
+    cell: CellDecision | None = None  # decision about a moving cell, or the exit from one
     newest_inconsistent: bool = False  # the newest position is further off its inertial data than noise explains
 
 
@@ -90,6 +93,7 @@ def tick(
         unsafe_to_climb=supervised.unsafe_to_climb,
         position_inconsistent=supervised.position_inconsistent,
         newest_inconsistent=supervised.newest_inconsistent,
+        cell=None if decided.cells is state.cells else describe_decision(state.cells, decided.cells, context.at_ns),
     )
     return _make_state(context, measured, supervised, decided, acted, reported), output
 
@@ -129,6 +133,7 @@ def _make_state(
         ),
         alarms=reported.alarms,
         risk=reported.risk,
+        cells=decided.cells,
     )
 
 

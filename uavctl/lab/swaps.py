@@ -19,10 +19,11 @@ import numpy as np
 from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.fleet.boxes import DOWNWASH
-from uavctl.fleet.cell import CellChoice, Conduct, MovingCell, PlannedPath, Report, decide_cell
+from uavctl.fleet.cell import CellChoice, MovingCell, PlannedPath, Report, decide_cell
 from uavctl.fleet.coordinator import START_NUMBER, CellParameters, CoordinatorState, advance, begin, issue, receive
 from uavctl.fleet.right_of_way import Ways, choose_guides
 from uavctl.fleet.voronoi import make_voronoi_cells
+from uavctl.records import Conduct
 from uavctl.smpc.answer import Answer, Preview
 from uavctl.smpc.conditioned.design import ConditionedDesign
 from uavctl.smpc.nominal import propagate_covariance
@@ -97,6 +98,12 @@ class _Vehicle:
     age: int = 0
     inbox: list[tuple[int, MovingCell]] = field(default_factory=list)  # with the step of arrival
     conduct: Conduct = Conduct.CELL
+
+    @property
+    def cell(self) -> MovingCell:
+        """Cell in use: it has one from the beginning."""
+        assert self.choice.cell is not None
+        return self.choice.cell
 
 
 def build_swap_design() -> ConditionedDesign:
@@ -215,14 +222,14 @@ class SwapWorld:
         if arrived:
             vehicle.estimate, vehicle.age = vehicle.state.copy(), 0
         if vehicle.age < self.design.horizon and (arrived or vehicle.choice.cell is not before.cell):
-            vehicle.plan = self._solve(vehicle.estimate, vehicle.age, vehicle.choice.cell, self.step)
+            vehicle.plan = self._solve(vehicle.estimate, vehicle.age, vehicle.cell, self.step)
             vehicle.plan_step = self.step
             self.plans += 1
             self.slack_plans += vehicle.plan.slack > 1e-6
         report = Report(
             self._describe_plan(vehicle.plan, vehicle.plan_step).advance(self.step),
             vehicle.estimate[list(self.design.plant.velocity_index)],
-            vehicle.choice.cell.number,
+            vehicle.cell.number,
             vehicle.choice.decided,
             vehicle.conduct,
         )
@@ -244,7 +251,7 @@ class SwapWorld:
                 vehicle.plan, vehicle.plan_step = answer, self.step
         self.decided += 1
         self.refused += vehicle.choice.cell is not cell
-        if vehicle.choice.cell.land:
+        if vehicle.cell.land:
             self.landed.add(i)
 
     def _describe_plan(self, answer: Answer, step: int) -> PlannedPath:
@@ -283,7 +290,7 @@ class SwapWorld:
     def _count_outside(self, vehicle: _Vehicle) -> None:
         if vehicle.conduct is Conduct.FREE:
             return
-        lower_m, upper_m = vehicle.choice.cell.find_limits(self.step - 1, 1)
+        lower_m, upper_m = vehicle.cell.find_limits(self.step - 1, 1)
         position_m = vehicle.state[list(self.design.plant.position_index)]
         self.cell_steps += 1
         self.outside += bool((position_m < lower_m[0]).any() or (position_m > upper_m[0]).any())

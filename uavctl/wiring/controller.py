@@ -34,6 +34,7 @@ from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope
+from uavctl.wiring.cells import build_cell_rows
 from uavctl.wiring.link import build_ages, build_delayed_link, compute_late_steps, compute_promised_probability
 from uavctl.wiring.mission import build_mission, build_names, build_reference_limits
 from uavctl.wiring.outside import build_outside_solver, compute_code_id, compute_controller_id
@@ -483,6 +484,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
         dt_ns=round(config.plant.dt_s * SECOND_NS),
         tick_ns=round(config.daemon.tick_s * SECOND_NS),
         dead_ns=round(config.plant.dead_time_s * SECOND_NS),
+        cell_rows=build_cell_rows(config, design) if config.mission.cells else None,
     )
 
 

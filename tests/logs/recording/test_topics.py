@@ -24,6 +24,8 @@ def test_every_recorded_type_has_one_topic() -> None:
         "InertialSample",
         "RiskRecord",
         "VehicleTruth",
+        "CellMessage",
+        "CellReport",
     }
     types = {
         name

@@ -302,6 +302,8 @@ class _ReflownLoop:
         if self._loop.outside == self._history.config.smpc.controller:
             self._loop.note_solve_time(record.answered_ns)
         self._tap.setpoint = None
+        if record.cell is not None:
+            self._loop.put_cell(record.cell)
         inputs = self._loop.gather_inputs(record.tick, at_ns, record.missed_ticks, record.stop)
         if self._history.flight.header.moved_inputs:
             inputs = inputs.with_measurements(record)
