@@ -1,9 +1,9 @@
-"""Fly swaps across a circle with many linear vehicles in one room, in moving cells or buffered Voronoi cells.
+"""Fly swaps across a circle with many vehicles in one room and one world, in moving cells or buffered Voronoi cells.
 
 It prints, for each number of vehicles, the figures of all seeds from the true positions: how many arrived, collisions,
 the closest pair, and the time to finish over that of a straight line. `--cycle` measures a cycle of the coordinator.
 
-    python tools/swaps.py --vehicles 2 4 8 12 --seeds 20 [--first 1000] [--method voronoi] [--loss 0.3] [--json]
+    python tools/swaps.py --vehicles 2 4 8 12 --seeds 20 [--first 1000] [--autopilot ardupilot] [--method voronoi]
     python tools/swaps.py --vehicles 20 --cycle
 """
 
@@ -15,16 +15,19 @@ import math
 import sys
 import time
 from dataclasses import asdict
+from pathlib import Path
 from statistics import median
 
 import numpy as np
 
 from uavctl.arrays import Array
-from uavctl.fleet.coordinator import advance, issue, receive
-from uavctl.lab.swaps import SwapCase, SwapResult, SwapWorld, build_swap_design, fly_swap
-from uavctl.smpc.conditioned.design import ConditionedDesign
+from uavctl.fleet.cell import PlannedPath, Report
+from uavctl.fleet.coordinator import CellParameters, advance, begin, issue, receive
+from uavctl.lab.swaps import SwapCase, SwapResult, fly_swap
 
-CYCLES, WARM_STEPS = 200, 12
+CYCLES = 200
+STAGES, DT_S = 49, 0.05  # of the presets of the autopilots
+SPEED_MPS = 1.5
 
 
 def make_grid(vehicles: int) -> Array:
@@ -33,18 +36,37 @@ def make_grid(vehicles: int) -> Array:
     return np.array(places_m[:vehicles])
 
 
-def measure_cycle_ms(vehicles: int, design: ConditionedDesign) -> tuple[float, float]:
-    """Measure cycles of the coordinator with a report of each vehicle: median and largest processor time [ms]."""
+def measure_cycle_ms(vehicles: int) -> tuple[float, float]:
+    """Measure cycles of the coordinator with a report of each vehicle: median and largest processor time [ms].
+
+    Each vehicle has a plan towards its goal, and takes every cell at once.
+    """
     begins_m = make_grid(vehicles)
-    world = SwapWorld(SwapCase(vehicles, seed=0, loss=0.0), design, begins_m, begins_m[::-1].copy())
-    for _ in range(WARM_STEPS):
-        world.advance()
-    state, reports = world.coordinator, dict(enumerate(world.coordinator.reports))
+    parameters = CellParameters(
+        distance_m=0.5,
+        room_lower_m=np.array([-3.0, -3.0, -3.0]),
+        room_upper_m=np.array([3.0, 3.0, 0.0]),
+        accel_mps2=np.array([3.9, 3.9, 1.5]),
+        speed_mps=np.array([SPEED_MPS, SPEED_MPS, 1.0]),
+        dt_s=DT_S,
+        stages=STAGES,
+    )
+    state = begin(0, begins_m, begins_m[::-1].copy(), parameters)
+    way_m = SPEED_MPS * DT_S * np.arange(STAGES)[:, None]
     durations_ms = []
-    for _ in range(CYCLES):
-        begin = time.process_time()
-        issue(receive(advance(state, world.step), reports), world.parameters)
-        durations_ms.append(1e3 * (time.process_time() - begin))
+    for cycle in range(CYCLES):
+        reports = {}
+        for number, cell in enumerate(state.newest):
+            begin_m = state.reports[number].plan.advance(2 * cycle).mean_m[0]
+            towards = cell.goal_m - begin_m
+            length_m = max(float(np.linalg.norm(towards)), 1e-9)
+            lower_m, upper_m = cell.find_limits(2 * cycle, STAGES)
+            mean_m = np.clip(begin_m + np.minimum(way_m, length_m) * towards / length_m, lower_m, upper_m)
+            plan = PlannedPath(2 * cycle, mean_m, np.zeros((STAGES, 3)))
+            reports[number] = Report(plan, np.zeros(3), cell.number, cell.number)
+        begin_s = time.process_time()
+        state = issue(receive(advance(state, 2 * cycle), reports), parameters)
+        durations_ms.append(1e3 * (time.process_time() - begin_s))
     return median(durations_ms), max(durations_ms)
 
 
@@ -60,9 +82,8 @@ def summarize(results: list[SwapResult]) -> dict[str, float]:
         "near_share": sum(result.near_share for result in results) / len(results),
         "finish_ratio": median(ratios) if ratios else math.nan,
         "finish_ratio_max": max(ratios, default=math.nan),
-        "outside_share": sum(result.outside_share for result in results) / len(results),
-        "slack_share": sum(result.slack_share for result in results) / len(results),
-        "refused_share": sum(result.refused_share for result in results) / len(results),
+        "exits": sum(result.exits for result in results),
+        "landings": sum(result.landings for result in results),
     }
 
 
@@ -73,19 +94,28 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--loss", type=float, default=0.3)
+    parser.add_argument("--autopilot", choices=("px4", "ardupilot"), default="px4")
+    parser.add_argument("--plant", choices=("linear", "quadrotor"), default="quadrotor")
     parser.add_argument("--method", choices=("cells", "voronoi"), default="cells")
+    parser.add_argument("--set", action="append", default=[], help="override of all vehicles")
+    parser.add_argument("--out", type=Path, help="folder for the recordings, which are not kept without it")
     parser.add_argument("--cycle", action="store_true", help="measure a cycle of the coordinator only")
     parser.add_argument("--json", action="store_true", help="print each swap as a line of JSON")
     options = parser.parse_args(arguments)
-    design, collisions = build_swap_design(), 0
+    collisions = 0
     for vehicles in options.vehicles:
         if options.cycle:
-            middle_ms, most_ms = measure_cycle_ms(vehicles, design)
+            middle_ms, most_ms = measure_cycle_ms(vehicles)
             print(json.dumps({"vehicles": vehicles, "cycle_ms": middle_ms, "cycle_max_ms": most_ms}))  # noqa: T201
             continue
         results = []
         for seed in range(options.first, options.first + options.seeds):
-            results.append(fly_swap(SwapCase(vehicles, seed, options.loss, options.method), design))
+            case = SwapCase(
+                vehicles, seed, options.autopilot, options.plant, options.loss, options.method,
+                overrides=tuple(options.set),
+            )  # fmt: skip
+            folder = None if options.out is None else options.out / f"swap-{vehicles}-{seed}"
+            results.append(fly_swap(case, folder))
             if options.json:
                 print(json.dumps(asdict(results[-1])), flush=True)  # noqa: T201
         summary = summarize(results)

@@ -23,7 +23,7 @@ from uavctl.cell_report import find_conduct, make_report
 from uavctl.config import Config
 from uavctl.errors import TickOverdueError, in_words
 from uavctl.event_codes import EventCode
-from uavctl.fleet.cell import parse_cell
+from uavctl.fleet.cell import CellChoice, parse_cell
 from uavctl.flight.controller import Controller
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
@@ -476,6 +476,11 @@ class ControlLoop:
             return str(error)
         self._inbox.put_cell(cell)
         return ""
+
+    @property
+    def cell_choice(self) -> CellChoice:
+        """Cell in use, and the newest one decided."""
+        return self._state.cells.choice
 
     def report_cell(self) -> CellReport | None:
         """Report to the coordinator of the cells how the vehicle moves; None before its position is known."""

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from uavctl.arrays import Array, Flags
 from uavctl.fleet.boxes import ROUNDING_M, Bounds, Boxes, divide_pairs, find_gaps, get_axis_distances_m
@@ -49,6 +50,9 @@ class CellParameters:
     # Room around a plan for its changes while a cell is on its way. With less, vehicles refuse more cells; with more,
     # two vehicles pass at a larger distance
     margin_m: float = 0.06
+    shift_stages: int = (
+        6  # change of the age of a position until a cell is decided about: three lost positions of 20 Hz
+    )
     reach_m: float = 1.2  # longest extension beyond the plan: about the way of a plan between two cells
     silence_s: float = 1.0  # time without a report after which a vehicle counts as an obstacle
 
@@ -187,7 +191,7 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
         [(step - report.plan.step) * parameters.dt_s > parameters.silence_s for report in state.reports], dtype=bool
     )
     is_free = np.array([report.conduct is Conduct.FREE for report in state.reports], dtype=bool)
-    positions_m, plans = _gather_plans(state, parameters)
+    positions_m, room_m, plans = _gather_plans(state, parameters)
     claims, is_blocked = _gather_claims(state, plans, is_free, is_silent, parameters)
     bounds = divide_pairs(claims, plans, parameters.distance_m)
     is_growing = is_free | is_silent
@@ -199,7 +203,7 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     )
     landing_places_m = _find_landing_places(state, is_growing | is_blocked, positions_m, parameters)
     guides_m = np.where(must_land[:, None], landing_places_m, guides_m)
-    wanted = _extend(plans, guides_m, parameters)
+    wanted = _extend(plans, guides_m, room_m, parameters)
     lower_m = np.maximum(wanted.lower_m, bounds.lower_m)
     upper_m = np.minimum(wanted.upper_m, bounds.upper_m)
     # Away from obstacles, but never so far that the plan in progress is cut
@@ -256,28 +260,35 @@ def _gather_boxes(cells: Sequence[MovingCell], step: int) -> Boxes:
     )
 
 
-def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[Array, Boxes]:
-    """Gather the positions (N, 3), and the boxes of the plans in progress with margins, inside of cells in use.
+def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[Array, Array, Boxes]:
+    """Gather the positions (N, 3), the room around each stage of a plan (N, S, 3), and the boxes of the plans.
 
-    Box s contains the mean of stages s and s + 1.
+    Box s contains the mean of stages s and s + 1, with the room around it, inside of a cell in use. The room is the
+    largest margin of the stages nearby: it moves there as the age of the position changes.
     """
     plans = [report.plan.advance(state.step) for report in state.reports]
     mean_m, margin_m = np.array([plan.mean_m for plan in plans]), np.array([plan.margin_m for plan in plans])
-    lower_m, upper_m = mean_m - margin_m - parameters.margin_m, mean_m + margin_m + parameters.margin_m
+    shift = parameters.shift_stages
+    padded_m = np.pad(margin_m, ((0, 0), (shift, shift), (0, 0)))
+    room_m = sliding_window_view(padded_m, 2 * shift + 1, axis=1).max(axis=3) + parameters.margin_m
+    lower_m, upper_m = mean_m - room_m, mean_m + room_m
     later = np.minimum(np.arange(parameters.stages) + 1, parameters.stages - 1)
     boxes = Boxes(np.minimum(lower_m, lower_m[:, later]), np.maximum(upper_m, upper_m[:, later]))
-    return mean_m[:, 0], boxes.take(state.used.is_empty, boxes.clip_to(state.used))
+    return mean_m[:, 0], room_m, boxes.take(state.used.is_empty, boxes.clip_to(state.used))
 
 
-def _extend(plans: Boxes, guides_m: Array, parameters: CellParameters) -> Boxes:
-    """Extend boxes towards places (N, 3), as far as a vehicle can depart from its plan, inside of the room."""
+def _extend(plans: Boxes, guides_m: Array, room_m: Array, parameters: CellParameters) -> Boxes:
+    """Extend boxes towards places (N, 3), as far as a vehicle can depart from its plan, inside of the walls.
+
+    A box that reaches a place has the room (N, S, 3) around it: a plan can rest there.
+    """
     # s(t) = min(a t² / 2, v t, reach)
     times_s = parameters.dt_s * np.arange(1, parameters.stages + 1)[:, None]
     way_m = np.minimum(0.5 * parameters.accel_mps2 * times_s**2, parameters.speed_mps * times_s)
     way_m = np.minimum(way_m, parameters.reach_m)
     places_m = guides_m[:, None]
-    lower_m = np.minimum(plans.lower_m, np.maximum(plans.lower_m - way_m, places_m - parameters.margin_m))
-    upper_m = np.maximum(plans.upper_m, np.minimum(plans.upper_m + way_m, places_m + parameters.margin_m))
+    lower_m = np.minimum(plans.lower_m, np.maximum(plans.lower_m - way_m, places_m - room_m))
+    upper_m = np.maximum(plans.upper_m, np.minimum(plans.upper_m + way_m, places_m + room_m))
     return Boxes(
         np.minimum(plans.lower_m, np.maximum(lower_m, parameters.room_lower_m)),
         np.maximum(plans.upper_m, np.minimum(upper_m, parameters.room_upper_m)),

@@ -134,6 +134,7 @@ class LockstepFleet:
         collisions: all collisions, in order of time.
         closest_approaches: least distance of each pair.
         wall_s: how long the flights took [s].
+        truths: newest true state of each vehicle.
 
     Args:
         prepared: the controllers, one a vehicle, with different `sim.system_id`.
@@ -167,6 +168,7 @@ class LockstepFleet:
         self.collisions: tuple[Collision, ...] = ()
         self.closest_approaches: tuple[ClosestApproach, ...] = ()
         self.wall_s = 0.0
+        self.truths: list[Truth] = []
 
     def fly(
         self,
@@ -253,6 +255,7 @@ class LockstepFleet:
 
     def _record_truth(self, number: int, truth: Truth) -> None:
         self._recorders[number].put(TRUTH, truth.at_ns, truth)
+        self.truths[number : number + 1] = [truth]
         if self._world_record is not None:
             self._world_record.put_truth(number, truth)
 

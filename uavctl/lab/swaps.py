@@ -1,55 +1,55 @@
-"""Swaps across a circle: many linear vehicles in one room, driven by the solver that flies, in moving cells.
+"""Swaps across a circle: many vehicles in one room and one world, each flown by its own control loop, in moving cells.
 
-1. Each vehicle has the plant of the preset with its own noise, and plans by scheme `age-conditioned` at each position
-   that arrives and at each cell that it takes. Its cell is a moving limit of each position.
+1. All vehicles have the preset of one autopilot, and fly in lockstep with a coordinator that runs ten times a second.
 2. Positions, cells and reports are lost independently. A cell or report that is not lost may be late, so they also
    arrive out of order.
-3. The figures are those of the true positions, along the lines between two steps.
+3. The figures are those of the true positions.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
 
-from uavctl.arrays import Array
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.config import load_config
 from uavctl.fleet.boxes import DOWNWASH
-from uavctl.fleet.cell import CellChoice, MovingCell, PlannedPath, Report, decide_cell
-from uavctl.fleet.coordinator import START_NUMBER, CellParameters, CoordinatorState, advance, begin, issue, receive
+from uavctl.fleet.cell import Report, format_cell, parse_report
+from uavctl.fleet.coordinator import CellParameters
 from uavctl.fleet.right_of_way import Ways, choose_guides
 from uavctl.fleet.voronoi import make_voronoi_cells
-from uavctl.records import Conduct
-from uavctl.smpc.answer import Answer, Preview
-from uavctl.smpc.conditioned.design import ConditionedDesign
-from uavctl.smpc.nominal import propagate_covariance
-from uavctl.wiring.controller import build_conditioned
+from uavctl.lab.lockstep import LockstepFleet
+from uavctl.records import CellMessage, CellReport
+from uavctl.wiring.cells import CYCLE_NS, Coordinator, build_cell_parameters
+from uavctl.wiring.controller import build_flight_design, prepare
 
 Method = Literal["cells", "voronoi"]
 Message = TypeVar("Message")
 
-ROOM_LOWER_M, ROOM_UPPER_M = (-3.0, -3.0, -3.0), (3.0, 3.0, 0.0)
-OVERRIDES = (
-    "sets.state_lower=[-3.0, -1.5, -inf, -3.0, -1.5, -inf, -3.0, -1.0, -inf]",
-    "sets.state_upper=[3.0, 1.5, inf, 3.0, 1.5, inf, 0.0, 1.0, inf]",
-    "plant.dt_s=0.1",
-    "plant.dead_time_s=0",
-    "smpc.horizon=20",
-    "risk.estimate=exact",
-    "link.delay_s=0",
-    "link.jitter_s=0",
-    "estimator.bias_drift=0",
-    "estimator.bias_max=0",
-)
 RADIUS_M, HEIGHT_M = 2.4, 1.2
-NEAR_M = 0.25  # distance from the goal at which a vehicle has arrived: five standard deviations of its hold
-STAY_STEPS = 10  # steps for which all vehicles stay there at the end
-PARTS = 4  # parts of a step whose distances count
-MAX_DELAY_STEPS = 2  # largest delay of a message
+NEAR_M = 0.25  # distance from the goal at which a vehicle has arrived: its hold, and a side that another one needs
+STAY_S = 1.0  # time for which all vehicles stay there at the end
+MAX_DELAY_NS = 2 * CYCLE_NS  # largest delay of a message
+# A room of 6 x 6 x 3 m
+_SETS = {
+    "px4": (
+        "sets.state_lower=[-3.0, -1.5, -inf, -3.0, -1.5, -inf, -3.0, -1.0, -inf]",
+        "sets.state_upper=[3.0, 1.5, inf, 3.0, 1.5, inf, 0.0, 1.0, inf]",
+    ),
+    "ardupilot": (
+        "sets.state_lower=[-3.0, -1.5, -inf, -inf, -inf, -inf, -3.0, -1.5, -inf, -inf, -inf, -inf,"
+        " -3.0, -1.0, -inf, -inf, -inf, -inf]",
+        "sets.state_upper=[3.0, 1.5, inf, inf, inf, inf, 3.0, 1.5, inf, inf, inf, inf, 0.0, 1.0, inf, inf, inf, inf]",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,15 @@ class SwapCase:
 
     vehicles: int
     seed: int
+    autopilot: Literal["px4", "ardupilot"] = "px4"
+    plant: Literal["linear", "quadrotor"] = "quadrotor"
     loss: float = 0.3  # of positions, cells and reports
     method: Method = "cells"
     distance_m: float = 0.5  # that pairs keep
-    collision_m: float = 0.3  # below it two vehicles collide
-    limit_s: float = 90.0
+    limit_s: float = 60.0
     cells_end_s: float = math.inf  # when the coordinator stops
-    free_vehicle: int | None = None  # vehicle that leaves its cell, and reports that
-    free_s: float = math.inf  # when
+    overrides: tuple[str, ...] = ()  # of all vehicles
+    faults: tuple[tuple[int, str], ...] = ()  # override of one vehicle, by its number
 
 
 @dataclass(frozen=True)
@@ -78,57 +79,17 @@ class SwapResult:
     finish_s: float  # when the last one arrived for good; NaN if one did not
     straight_s: float  # time of the longest way, alone and without disturbance
     closest: float  # least distance of a pair over the stated one: horizontal, or vertical over `DOWNWASH`
-    near_share: float  # share of steps of a pair below the stated distance
-    collisions: int  # pairs that collided
-    outside_share: float  # share of steps outside of the cell in use
-    slack_share: float  # share of plans with slack
-    refused_share: float  # share of decided cells that were refused
+    near_share: float  # share of the truths of a pair below the stated distance
+    collisions: int
+    exits: int  # times that vehicles left their cells
     landings: int  # vehicles told to land
-
-
-@dataclass(eq=False)
-class _Vehicle:
-    """A linear vehicle with its planner's memory."""
-
-    state: Array  # true state (n_x,)
-    estimate: Array  # predicted state (n_x,)
-    choice: CellChoice
-    plan: Answer
-    plan_step: int
-    age: int = 0
-    inbox: list[tuple[int, MovingCell]] = field(default_factory=list)  # with the step of arrival
-    conduct: Conduct = Conduct.CELL
-
-    @property
-    def cell(self) -> MovingCell:
-        """Cell in use: it has one from the beginning."""
-        assert self.choice.cell is not None
-        return self.choice.cell
-
-
-def build_swap_design() -> ConditionedDesign:
-    """Build the design of all vehicles."""
-    return build_conditioned(load_config("room", list(OVERRIDES)), for_flight=False)
-
-
-def make_cell_parameters(design: ConditionedDesign, distance_m: float) -> CellParameters:
-    """Return the constants of the cells."""
-    upper, input_upper = design.state_set.bounds[1], design.solver.problem.input_set.bounds[1]
-    return CellParameters(
-        distance_m=distance_m,
-        room_lower_m=np.array(ROOM_LOWER_M),
-        room_upper_m=np.array(ROOM_UPPER_M),
-        accel_mps2=input_upper.copy(),
-        speed_mps=upper[list(design.plant.velocity_index)],
-        dt_s=design.plant.dt_s,
-        stages=design.horizon + 1,
-    )
 
 
 def make_circle(vehicles: int) -> tuple[Array, Array]:
     """Return begins and goals (N, 3) [m]: opposite places of a circle."""
     angles = 2.0 * np.pi * np.arange(vehicles) / vehicles
     begins = np.column_stack([RADIUS_M * np.cos(angles), RADIUS_M * np.sin(angles), np.full(vehicles, -HEIGHT_M)])
+    begins = np.round(begins, 3)
     return begins, begins * np.array([-1.0, -1.0, 1.0])
 
 
@@ -140,205 +101,172 @@ def compute_straight_time_s(begins_m: Array, goals_m: Array, parameters: CellPar
     return float(time_s.max())
 
 
-class SwapWorld:
-    """One room with all vehicles and their coordinator, step by step."""
+class CellTraffic:
+    """Messages between the coordinator and the control loops of a fleet in lockstep: some are lost, or late.
 
-    def __init__(self, case: SwapCase, design: ConditionedDesign, begins_m: Array, goals_m: Array) -> None:
-        self.case, self.design = case, design
-        self.parameters = make_cell_parameters(design, case.distance_m)
-        self.goals_m, self.step = goals_m, 0
-        self.coordinator: CoordinatorState = begin(0, begins_m, goals_m, self.parameters)
-        # Own generators: the losses do not change the noise
-        noise, link = np.random.SeedSequence(case.seed).spawn(2)
-        self._noise, self._link = np.random.default_rng(noise), np.random.default_rng(link)
-        self._covs = propagate_covariance(design.plant, design.horizon)
-        self._reports: list[tuple[int, tuple[int, Report]]] = []  # with the step of arrival, and the vehicle
-        self.plans = self.slack_plans = self.decided = self.refused = self.outside = self.cell_steps = 0
+    Args:
+        case: Losses, method and end of the coordinator.
+        fleet: Its control loops.
+        parameters: Constants of the cells.
+    """
+
+    def __init__(self, case: SwapCase, fleet: LockstepFleet, parameters: CellParameters) -> None:
+        self.coordinator = Coordinator(parameters, case.vehicles)
         self.landed: set[int] = set()
-        self.vehicles = []
-        for place_m, cell in zip(begins_m, self.coordinator.newest, strict=True):
-            x = design.plant.equilibrium(tuple(place_m))
-            answer = self._solve(x, 0, cell, 0)
-            self.vehicles.append(_Vehicle(x, x, CellChoice(cell, START_NUMBER), answer, 0))
+        self._case, self._fleet, self._parameters = case, fleet, parameters
+        self._link = np.random.default_rng((case.seed, case.vehicles))
+        self._reports: list[tuple[int, int, CellReport]] = []  # with the time of arrival, and the vehicle
+        self._cells: list[tuple[int, int, CellMessage]] = []
+        self._newest: dict[int, Report] = {}
+
+    def exchange(self, at_ns: int) -> None:
+        """Deliver what has arrived by a time; where a cycle begins, take reports and send cells."""
+        for number, cell in _take_due(self._cells, at_ns):
+            self._fleet.loops[number].put_cell(cell)
+            if cell.land:
+                self.landed.add(number)
+        if at_ns % CYCLE_NS or at_ns >= self._case.cells_end_s * SECOND_NS:
+            return
+        for number, loop in enumerate(self._fleet.loops):
+            report = loop.report_cell()
+            if report is not None:
+                self._send(self._reports, at_ns, number, report)
+        reports: dict[int, CellReport] = {}
+        for number, report in _take_due(self._reports, at_ns):
+            if number not in reports or reports[number].step <= report.step:
+                reports[number] = report
+        for number, cell in self._plan_cells(at_ns, reports).items():
+            self._send(self._cells, at_ns, number, cell)
+
+    def _plan_cells(self, at_ns: int, reports: dict[int, CellReport]) -> dict[int, CellMessage]:
+        if self._case.method == "cells":
+            return self.coordinator.update(at_ns, reports)
+        self._newest |= {number: parse_report(report) for number, report in reports.items()}
+        if len(self._newest) < self._case.vehicles:
+            return {}
+        parameters, newest = self._parameters, [self._newest[number] for number in range(self._case.vehicles)]
+        positions_m = np.array([report.plan.mean_m[0] for report in newest])
+        goals_m = np.array([report.goal_m for report in newest])
+        ways = Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m)
+        step = at_ns // round(parameters.dt_s * SECOND_NS)
+        cells = make_voronoi_cells(positions_m, choose_guides(positions_m, goals_m, ways), step + 1, step, parameters)
+        return {number: format_cell(cell) for number, cell in enumerate(cells)}
+
+    def _send(self, queue: list[tuple[int, int, Message]], at_ns: int, number: int, message: Message) -> None:
+        """Put a message into a queue with the time of its arrival, unless it is lost."""
+        is_lost, delay_ns = self._link.random() < self._case.loss, int(self._link.integers(MAX_DELAY_NS + 1))
+        if not is_lost:
+            queue.append((at_ns + delay_ns, number, message))
+
+
+def _take_due(queue: list[tuple[int, int, Message]], at_ns: int) -> list[tuple[int, Message]]:
+    """Take the messages that have arrived by a time, with the numbers of their vehicles."""
+    due = [(number, message) for arrival_ns, number, message in queue if arrival_ns <= at_ns]
+    queue[:] = [entry for entry in queue if entry[0] > at_ns]
+    return due
+
+
+def measure_distances(positions_m: Array, distance_m: float) -> Array:
+    """Return the distance of each pair over the stated one: (pairs,)."""
+    pairs = np.array(list(combinations(range(len(positions_m)), 2)), dtype=int).reshape(-1, 2)
+    offsets_m = positions_m[pairs[:, 0]] - positions_m[pairs[:, 1]]
+    level_m, vertical_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1]), np.abs(offsets_m[:, 2])
+    return np.asarray(np.maximum(level_m, vertical_m / DOWNWASH) / distance_m)
+
+
+class Swap:
+    """A swap that can be watched step by step.
+
+    Args:
+        case: What is flown.
+        begins_m: Places at which the vehicles begin (N, 3).
+        goals_m: Places that they go to (N, 3).
+        folder: Folder of the recordings.
+    """
+
+    def __init__(self, case: SwapCase, begins_m: Array, goals_m: Array, folder: Path) -> None:
+        self.case, self.begins_m, self.goals_m = case, begins_m, goals_m
+        seeds = np.random.default_rng(case.seed).integers(2**31, size=case.vehicles)
+        configs = [
+            load_config(
+                f"room-{case.autopilot}",
+                [
+                    *_SETS[case.autopilot],
+                    "mission.cells=true",
+                    f"sim.plant={case.plant}",
+                    f"link.loss={case.loss}",
+                    f"duration_s={case.limit_s}",
+                    f"sim.system_id={number + 1}",
+                    f"sim.seed={seed}",
+                    f"sim.start_position_m={begin_m.tolist()}",
+                    f"mission.waypoints=[{goal_m.tolist()}]",
+                    *case.overrides,
+                    *(override for vehicle, override in case.faults if vehicle == number),
+                ],
+            )
+            for number, (seed, begin_m, goal_m) in enumerate(zip(seeds, begins_m, goals_m, strict=True))
+        ]
+        design = build_flight_design(configs[0])
+        self.parameters = build_cell_parameters(configs, case.distance_m)
+        paths = [folder / f"vehicle-{number + 1}" / "flight.mcap" for number in range(case.vehicles)]
+        prepared = [prepare(config, design) for config in configs]
+        self.fleet = LockstepFleet(prepared, paths, folder / "world.mcap")
+        self.traffic = CellTraffic(case, self.fleet, self.parameters)
+        self._dt_ns = round(self.parameters.dt_s * SECOND_NS)
+        self.closest = np.full(math.comb(case.vehicles, 2), np.inf)
+        self.near = self.pairs = 0
+        self.away_s = np.zeros(case.vehicles)  # when each vehicle was last away from its goal
 
     @property
     def positions_m(self) -> Array:
         """True positions (N, 3)."""
-        return np.array([vehicle.state[list(self.design.plant.position_index)] for vehicle in self.vehicles])
+        return np.array([truth.position_m for truth in self.fleet.truths])
 
-    def advance(self) -> None:
-        """Advance by one step: coordinator, vehicles, then the motion."""
-        case, plant = self.case, self.design.plant
-        if self.step * plant.dt_s < case.cells_end_s:
-            self._run_coordinator()
-        for i, vehicle in enumerate(self.vehicles):
-            self._run_vehicle(i, vehicle)
-        # x(k+1) = A x(k) + B u(k) + E w(k)
-        noise = self._noise.multivariate_normal(np.zeros(len(plant.w)), plant.w, size=len(self.vehicles))
-        self.step += 1
-        for vehicle, w in zip(self.vehicles, noise, strict=True):
-            u = self._select_input(vehicle)
-            vehicle.state = plant.a @ vehicle.state + plant.b @ u + plant.e @ w
-            vehicle.estimate = plant.a @ vehicle.estimate + plant.b @ u
-            vehicle.age += 1
-            self._count_outside(vehicle)
+    def fly(self, watch: Callable[[float], bool] = lambda _: True) -> SwapResult:
+        """Fly to the end.
 
-    def _run_coordinator(self) -> None:
-        due: dict[int, Report] = {}
-        for at, (i, report) in self._reports:
-            if at <= self.step and (i not in due or due[i].order < report.order):
-                due[i] = report
-        self._reports = [entry for entry in self._reports if entry[0] > self.step]
-        state = receive(advance(self.coordinator, self.step), due)
-        if self.case.method == "cells":
-            state = issue(state, self.parameters)
-            cells = state.newest
-        else:
-            parameters = self.parameters
-            positions_m = np.array([report.plan.mean_m[0] for report in state.reports])
-            ways = Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m)
-            guides_m = choose_guides(positions_m, self.goals_m, ways)
-            cells = make_voronoi_cells(positions_m, guides_m, self.step + 1, self.step, parameters)
-        self.coordinator = state
-        for vehicle, cell in zip(self.vehicles, cells, strict=True):
-            self._send(vehicle.inbox, cell)
+        Args:
+            watch: Called with the seconds flown after each Δt; false ends the flights.
+        """
 
-    def _send(self, inbox: list[tuple[int, Message]], message: Message) -> None:
-        """Put a message into an inbox with the step of its arrival, unless it is lost."""
-        lost, delay = self._link.random() < self.case.loss, int(self._link.integers(MAX_DELAY_STEPS + 1))
-        if not lost:
-            inbox.append((self.step + delay, message))
+        def continue_after(flown_s: float) -> bool:
+            self.traffic.exchange(round(flown_s * SECOND_NS) - self._dt_ns)
+            if len(self.fleet.truths) == self.case.vehicles:
+                self._measure(flown_s)
+            return watch(flown_s) and flown_s - self.away_s.max() < STAY_S
 
-    def _run_vehicle(self, i: int, vehicle: _Vehicle) -> None:
-        case = self.case
-        if i == case.free_vehicle and self.step * self.design.plant.dt_s >= case.free_s:
-            vehicle.conduct = Conduct.FREE
-        due = [cell for at, cell in vehicle.inbox if at <= self.step]
-        vehicle.inbox = [entry for entry in vehicle.inbox if entry[0] > self.step]
-        before = vehicle.choice
-        for cell in due:
-            self._decide(i, vehicle, cell)
-        arrived = self._link.random() >= case.loss
-        if arrived:
-            vehicle.estimate, vehicle.age = vehicle.state.copy(), 0
-        if vehicle.age < self.design.horizon and (arrived or vehicle.choice.cell is not before.cell):
-            vehicle.plan = self._solve(vehicle.estimate, vehicle.age, vehicle.cell, self.step)
-            vehicle.plan_step = self.step
-            self.plans += 1
-            self.slack_plans += vehicle.plan.slack > 1e-6
-        report = Report(
-            self._describe_plan(vehicle.plan, vehicle.plan_step).advance(self.step),
-            vehicle.estimate[list(self.design.plant.velocity_index)],
-            vehicle.cell.number,
-            vehicle.choice.decided,
-            vehicle.conduct,
+        with ExitStack() as stack:
+            stack.callback(self.fleet.close)
+            self.fleet.fly(continue_after)
+        return self._summarize()
+
+    def _measure(self, flown_s: float) -> None:
+        positions_m = self.positions_m
+        distances = measure_distances(positions_m, self.case.distance_m)
+        self.closest = np.minimum(self.closest, distances)
+        self.near += int((distances < 1.0).sum())
+        self.pairs += distances.size
+        self.away_s[np.linalg.norm(positions_m - self.goals_m, axis=1) > NEAR_M] = flown_s
+
+    def _summarize(self) -> SwapResult:
+        case, choices = self.case, [loop.cell_choice for loop in self.fleet.loops]
+        has_arrived = self.away_s < case.limit_s - STAY_S
+        return SwapResult(
+            vehicles=case.vehicles,
+            seed=case.seed,
+            arrived=int(has_arrived.sum()),
+            finish_s=float(self.away_s.max()) if has_arrived.all() else math.nan,
+            straight_s=compute_straight_time_s(self.begins_m, self.goals_m, self.parameters),
+            closest=float(self.closest.min(initial=np.inf)),
+            near_share=self.near / max(self.pairs, 1),
+            collisions=len(self.fleet.collisions),
+            exits=sum(choice.exits for choice in choices),
+            landings=len(self.traffic.landed),
         )
-        self._send(self._reports, (i, report))
-
-    def _decide(self, i: int, vehicle: _Vehicle, cell: MovingCell) -> None:
-        if cell.number <= vehicle.choice.decided:
-            return
-        if self.case.method == "voronoi":
-            vehicle.choice = CellChoice(cell, cell.number)
-            return
-        before = vehicle.choice
-        vehicle.choice = decide_cell(before, cell, self.step, self._describe_plan(vehicle.plan, vehicle.plan_step))
-        if vehicle.choice.cell is not cell and vehicle.age < self.design.horizon:
-            # The plan in progress has changed since its report: a new one may keep the cell
-            answer = self._solve(vehicle.estimate, vehicle.age, cell, self.step)
-            vehicle.choice = decide_cell(before, cell, self.step, self._describe_plan(answer, self.step))
-            if vehicle.choice.cell is cell:
-                vehicle.plan, vehicle.plan_step = answer, self.step
-        self.decided += 1
-        self.refused += vehicle.choice.cell is not cell
-        if vehicle.cell.land:
-            self.landed.add(i)
-
-    def _describe_plan(self, answer: Answer, step: int) -> PlannedPath:
-        rows, index = self._find_rows(), list(self.design.plant.position_index)
-        # The larger back-off of the two sides
-        margin_m = np.maximum(answer.backoff_x[:, rows[0]], answer.backoff_x[:, rows[1]])
-        return PlannedPath(step, answer.states[:, index], margin_m)
-
-    def _find_rows(self) -> tuple[list[int], list[int]]:
-        """Find the rows of the upper and lower limits of the positions."""
-        c, index = self.design.state_set.c, self.design.plant.position_index
-        upper, lower = ([int(np.flatnonzero(sign * c[:, i] > 0.0)[0]) for i in index] for sign in (1.0, -1.0))
-        return upper, lower
-
-    def _solve(self, x: Array, age: int, cell: MovingCell, step: int) -> Answer:
-        """Plan inside of a cell."""
-        design, (upper, lower) = self.design, self._find_rows()
-        lower_m, upper_m = cell.find_limits(step, design.horizon)
-        limits = np.tile(design.state_set.b, (design.horizon + 1, 1))
-        limits[1:, upper] = np.minimum(limits[1:, upper], upper_m)
-        limits[1:, lower] = np.minimum(limits[1:, lower], -lower_m)
-        resting = limits[-1].copy()
-        resting[upper] = np.minimum(resting[upper], cell.upper_m[-1])
-        resting[lower] = np.minimum(resting[lower], -cell.lower_m[-1])
-        target = design.plant.equilibrium(tuple(cell.goal_m))
-        preview = Preview(limits=limits, age=age, cov=self._covs[age] if age else None, resting_limits=resting)
-        return design.solver.solve(step, x, target, preview)
-
-    def _select_input(self, vehicle: _Vehicle) -> Array:
-        plant = self.design.plant
-        if vehicle.conduct is Conduct.FREE:
-            return np.zeros(plant.n_u)  # it drifts on
-        index = self.step - 1 - vehicle.plan_step
-        return vehicle.plan.inputs[index] if index < len(vehicle.plan.inputs) else np.zeros(plant.n_u)
-
-    def _count_outside(self, vehicle: _Vehicle) -> None:
-        if vehicle.conduct is Conduct.FREE:
-            return
-        lower_m, upper_m = vehicle.cell.find_limits(self.step - 1, 1)
-        position_m = vehicle.state[list(self.design.plant.position_index)]
-        self.cell_steps += 1
-        self.outside += bool((position_m < lower_m[0]).any() or (position_m > upper_m[0]).any())
 
 
-def measure_distances(before_m: Array, after_m: Array, distance_m: float) -> Array:
-    """Return the least distance of each pair over the stated one, along the lines of a step: (pairs,)."""
-    pairs = np.array(list(combinations(range(len(before_m)), 2))).reshape(-1, 2)
-    shares = np.arange(1, PARTS + 1)[:, None, None] / PARTS
-    positions_m = before_m + shares * (after_m - before_m)
-    offsets_m = positions_m[:, pairs[:, 0]] - positions_m[:, pairs[:, 1]]
-    level_m, vertical_m = np.hypot(offsets_m[..., 0], offsets_m[..., 1]), np.abs(offsets_m[..., 2])
-    return np.asarray((np.maximum(level_m, vertical_m / DOWNWASH) / distance_m).min(axis=0))
-
-
-def fly_swap(case: SwapCase, design: ConditionedDesign) -> SwapResult:
-    """Fly a swap to its end."""
+def fly_swap(case: SwapCase, folder: Path | None = None) -> SwapResult:
+    """Fly a swap to its end; the recordings stay in a folder, if one is given."""
     begins_m, goals_m = make_circle(case.vehicles)
-    return fly_ways(case, design, begins_m, goals_m)
-
-
-def fly_ways(case: SwapCase, design: ConditionedDesign, begins_m: Array, goals_m: Array) -> SwapResult:
-    """Fly all vehicles from places to goals, (N, 3)."""
-    world = SwapWorld(case, design, begins_m, goals_m)
-    dt_s, positions_m = design.plant.dt_s, world.positions_m
-    closest = np.full(math.comb(case.vehicles, 2), np.inf)
-    near = steps = 0
-    away_step = np.zeros(case.vehicles, dtype=int)  # last step away from the goal
-    while world.step * dt_s < case.limit_s and world.step - away_step.max() < STAY_STEPS:
-        world.advance()
-        after_m = world.positions_m
-        distances = measure_distances(positions_m, after_m, case.distance_m)
-        closest, positions_m = np.minimum(closest, distances), after_m
-        near += int((distances < 1.0).sum())
-        steps += distances.size
-        away_step[np.linalg.norm(positions_m - goals_m, axis=1) > NEAR_M] = world.step
-    has_arrived = away_step < world.step
-    return SwapResult(
-        vehicles=case.vehicles,
-        seed=case.seed,
-        arrived=int(has_arrived.sum()),
-        finish_s=float(away_step.max() * dt_s) if has_arrived.all() else math.nan,
-        straight_s=compute_straight_time_s(begins_m, goals_m, world.parameters),
-        closest=float(closest.min(initial=np.inf)),
-        near_share=near / max(steps, 1),
-        collisions=int((closest * case.distance_m < case.collision_m).sum()),
-        outside_share=world.outside / max(world.cell_steps, 1),
-        slack_share=world.slack_plans / max(world.plans, 1),
-        refused_share=world.refused / max(world.decided, 1),
-        landings=len(world.landed),
-    )
+    with tempfile.TemporaryDirectory() as temporary_folder:
+        return Swap(case, begins_m, goals_m, folder or Path(temporary_folder)).fly()

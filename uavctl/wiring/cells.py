@@ -16,6 +16,7 @@ from uavctl.flight.cells import CellRows
 from uavctl.flight.limits import AXES
 from uavctl.records import CellMessage, CellReport
 from uavctl.smpc.conditioned.design import AnyDesign
+from uavctl.smpc.plant import Plant
 
 CYCLE_NS = SECOND_NS // 10  # time between two cycles of the coordinator
 
@@ -26,18 +27,28 @@ def build_cell_rows(config: Config, design: AnyDesign) -> CellRows:
     Raises:
         DesignError: The plant lacks an axis, a position lacks a limit, or the mission is a trajectory.
     """
-    key, plant, c = "mission.cells", design.plant, design.state_set.c
+    key, plant = "mission.cells", design.plant
     if plant.axes != AXES:
         raise DesignError(key, f"the plant has the axes {', '.join(plant.axes)}", f"give it {', '.join(AXES)}")
     if config.mission.trajectory != type(config.mission.trajectory)():
         raise DesignError(key, "a trajectory has no place to wait at", "fly waypoints, or without cells")
-    upper, lower = (np.array([_find_row(c, i, sign, key) for i in plant.position_index]) for sign in (1.0, -1.0))
+    return find_cell_rows(plant, design.state_set.c)
+
+
+def find_cell_rows(plant: Plant, c: Array) -> CellRows:
+    """Find the rows of the matrix of a state set (m_x, n_x) that limit the positions of a plant.
+
+    Raises:
+        DesignError: A position lacks a limit.
+    """
+    upper, lower = (np.array([_find_row(c, i, sign) for i in plant.position_index]) for sign in (1.0, -1.0))
     index = np.array(plant.position_index)
     return CellRows(upper, lower, np.abs(c[upper, index]), np.abs(c[lower, index]), index)
 
 
-def _find_row(c: Array, state: int, sign: float, key: str) -> int:
+def _find_row(c: Array, state: int, sign: float) -> int:
     """Find the row that limits one state alone, upwards or downwards."""
+    key = "mission.cells"
     rows = np.flatnonzero(((c != 0.0).sum(axis=1) == 1) & (sign * c[:, state] > 0.0))
     if not len(rows):
         side = "upper" if sign > 0.0 else "lower"
