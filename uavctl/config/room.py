@@ -21,7 +21,7 @@ ROOM_KEYS = ("sets", "target.position_m", "limits.accel_mps2")
 
 
 class RoomConfig(Section, frozen=True, kw_only=True):
-    """Limits of the vehicle's centre, and its target, by name."""
+    """Limits of the vehicle's centre, and its target (default: that of the base), by name."""
 
     north_m: Annotated[Span, declare("least and largest position north", "m")] = None
     east_m: Annotated[Span, declare("least and largest position east", "m")] = None
@@ -29,9 +29,9 @@ class RoomConfig(Section, frozen=True, kw_only=True):
     speed_mps: Annotated[Size, declare("largest speed north, and east", "m/s")] = None
     climb_mps: Annotated[Size, declare("largest speed up and down", "m/s")] = None
     accel_mps2: Annotated[Size, declare("largest acceleration setpoint north, and east", "m/s²")] = None
-    target_north_m: Annotated[Number | None, declare("target; default: that of the base", "m")] = None
-    target_east_m: Annotated[Number | None, declare("target; default: that of the base", "m")] = None
-    target_height_m: Annotated[Number | None, declare("target; default: that of the base", "m")] = None
+    target_north_m: Annotated[Number | None, declare("target", "m")] = None
+    target_east_m: Annotated[Number | None, declare("target", "m")] = None
+    target_height_m: Annotated[Number | None, declare("target", "m")] = None
 
 
 _AXIS_KEYS = {
