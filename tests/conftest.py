@@ -150,4 +150,6 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def pytest_configure() -> None:
     settings.register_profile("patient", deadline=None)  # how long an example takes is the machine's affair
+    # For `make test`, of which a person runs many: `make test-all` asks four times as many examples of each property.
+    settings.register_profile("quick", deadline=None, max_examples=25)
     settings.load_profile("patient")

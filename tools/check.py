@@ -31,6 +31,8 @@ _PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWR
 PROCESSES = {"": 3, "--all": 2, "--long": 2}
 # Expressions of pytest's marks, by the option that asks for these tests.
 MARKS = {"": "not slow and not long and not manual", "--all": "not long and not manual", "--long": "long"}
+# Profiles of Hypothesis (tests/conftest.py).
+PROFILES = {"": "quick", "--all": "patient", "--long": "patient"}
 
 
 class StageError(Exception):
@@ -124,7 +126,7 @@ def check_tests(failed: threading.Event, option: str) -> str:
     one process, so that shared parts are made once; tests/conftest.py gives the order.
     """
     command = [str(BIN / "pytest"), "-n", str(PROCESSES[option]), "-m", MARKS[option]]
-    command += ["--dist", "loadfile", "--no-loadscope-reorder"]
+    command += ["--dist", "loadfile", "--no-loadscope-reorder", "--hypothesis-profile", PROFILES[option]]
     if option == "--all":
         command += [f"--ignore={test}" for test in list_own_tests()]
     with subprocess.Popen(command, cwd=ROOT, env={**os.environ, **_PROCESSES}) as process:

@@ -139,7 +139,7 @@ def test_the_ages_before_the_flight_count() -> None:
     config, ticks = load_room(), 900
     controller = build_controller(config)
     assert controller.risk is not None
-    inputs, outputs = fly(config, 3, ticks, INDEPENDENT)
+    inputs, outputs = fly(config, 3, ticks, INDEPENDENT, steps=20)
     risks = list_risks(outputs)
     waited = [risk for risk in risks if risk.outside is None]
     record = AgeRecord()
@@ -156,7 +156,7 @@ def test_the_ages_before_the_flight_count() -> None:
 def test_a_source_that_is_off_before_the_flight_says_nothing_of_the_link() -> None:
     config, off = load_room(), range(600, 800)
     horizon = build_controller(config).horizon
-    _, outputs = fly(config, 3, 900, INDEPENDENT, off)
+    _, outputs = fly(config, 3, 900, INDEPENDENT, off, steps=1)
     waited = [risk for risk in list_risks(outputs) if risk.outside is None]
     assert max(risk.age for risk in waited) == horizon
     _, continuation = get_link(waited[-1].level)

@@ -17,6 +17,7 @@ from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
 SYSTEM_IDS = (1, 2)
 DURATION_S = 8.0
+HEAD_ON_S = 4.0
 
 
 def make_vehicle(number: int, start_m: Vec3, target_m: Vec3, *overrides: str) -> Prepared:
@@ -49,8 +50,13 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> FlownFleet:
 @pytest.fixture(scope="module")
 def head_on(tmp_path_factory: pytest.TempPathFactory) -> FlownFleet:
     """Two vehicles that change places on one line."""
+    return fly_head_on(tmp_path_factory.mktemp("head-on"))
+
+
+def fly_head_on(folder: Path) -> FlownFleet:
+    """Fly until both lie on the floor."""
     ends: list[Vec3] = [(-1.5, 0.0, -1.2), (1.5, 0.0, -1.2)]
-    return fly_pair(tmp_path_factory.mktemp("head-on"), ends, ends[::-1])
+    return fly_pair(folder, ends, ends[::-1], f"duration_s={HEAD_ON_S}")
 
 
 def test_two_vehicles_with_separate_ways_arrive_and_hold(apart: FlownFleet) -> None:
@@ -98,7 +104,7 @@ def test_the_recordings_tell_the_collision_and_the_closest_approach(head_on: Flo
 def test_one_recording_has_the_truth_of_all(head_on: FlownFleet) -> None:
     together = list(read_kind(head_on.world_path, FleetTruth))
     each = read_truths(head_on)
-    assert len(together) == len(each[0]) == len(each[1]) == round(DURATION_S / 0.05)
+    assert len(together) == len(each[0]) == len(each[1]) == round(HEAD_ON_S / 0.05)
     for truth, alone in zip(together, zip(*each, strict=True), strict=True):
         assert truth.at_ns == alone[0].at_ns == alone[1].at_ns
         assert truth.vehicles == tuple(
@@ -119,8 +125,7 @@ def test_each_recording_replays_alone(head_on: FlownFleet, apart: FlownFleet) ->
 
 
 def test_the_same_seeds_give_the_same_flights(head_on: FlownFleet, tmp_path: Path) -> None:
-    ends: list[Vec3] = [(-1.5, 0.0, -1.2), (1.5, 0.0, -1.2)]
-    again = fly_pair(tmp_path, ends, ends[::-1])
+    again = fly_head_on(tmp_path)
     assert again.collisions == head_on.collisions
     assert again.closest_approaches == head_on.closest_approaches
     assert read_truths(again) == read_truths(head_on)
@@ -141,12 +146,13 @@ def test_vehicles_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:
 def test_a_vehicle_that_hovers_below_another_one_is_pushed_down_and_holds(tmp_path: Path) -> None:
     places: list[Vec3] = [(0.0, 0.0, -1.6), (0.0, 0.0, -1.2)]
 
-    def fly_lower(strength: float) -> list[Truth]:
-        flight = fly_pair(tmp_path / str(strength), places, places, f"sim.downwash={strength}")
+    def fly_lower(strength: float, duration_s: float) -> list[Truth]:
+        downwash = f"sim.downwash={strength}", f"duration_s={duration_s}"
+        flight = fly_pair(tmp_path / str(strength), places, places, *downwash)
         assert flight.collisions == ()
         return read_truths(flight)[1]
 
-    blown, calm = fly_lower(1.0), fly_lower(0.0)
+    blown, calm = fly_lower(1.0, DURATION_S), fly_lower(0.0, 1.0)
     # PX4 flies an acceleration open loop after 0.08 s: until the controller sees the fall, x = ½ a t².
     at_s, share = 0.2, 6.0 / 34.0
     sunk_m = blown[round(at_s / 0.05)].position_m[2] - calm[round(at_s / 0.05)].position_m[2]

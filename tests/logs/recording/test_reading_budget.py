@@ -97,7 +97,7 @@ RECORDS = st.one_of(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=3 * settings().max_examples)
 @given(st.lists(RECORDS, max_size=8), st.binary(max_size=50))
 @pytest.mark.fault(96)
 def test_whatever_records_say_the_work_is_bounded_and_the_scan_goes_forward(records: list[bytes], rest: bytes) -> None:
@@ -318,7 +318,7 @@ def test_a_wrapped_message_is_no_longer_than_a_frame(tmp_path: Path) -> None:
         read_mcap(path)
 
 
-@settings(max_examples=300)
+@settings(max_examples=3 * settings().max_examples)
 @given(FIELDS, FIELDS, FIELDS, FIELDS, st.binary(max_size=300), st.sampled_from(["ros1", "cdr"]))
 @pytest.mark.fault(96)
 def test_whatever_a_definition_says_the_steps_are_few(
