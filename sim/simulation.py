@@ -6,12 +6,14 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from sim.autopilot.autopilot import Autopilot
 from sim.cameras import Cameras
 from sim.channel import Channel, find_earliest_ns, is_within
 from sim.faults import Faults, find_active_faults, merge_fault_spans
+from sim.radio import Sender, SharedRadio
 from sim.vehicle.linear import LinearVehicle, make_linear_model
 from sim.vehicle.quadrotor import STEP_S, Quadrotor
 from sim.wind import Wind
@@ -52,7 +54,8 @@ class Peers:
     """Vehicle, autopilot, cameras and the radio channel that carries positions.
 
     The vehicle's link is a wire: no loss (but for `link.uplink_blackout`), no delay. Positions go through the channel.
-    With `shared_link` (one URL for both) positions come on the vehicle's link, still through the channel.
+    With `shared_link` (one URL for both) positions come on the vehicle's link, still through the channel. With a radio
+    that several vehicles share (`join_radio`), positions go through its sender first.
 
     `on_truth` gets one `Truth` for every boundary start_ns + k Δt: the state x(k), and the input that acts
     from there on. It is therefore called when time moves *past* the boundary: what arrives at the
@@ -70,7 +73,7 @@ class Peers:
         on_truth: Callable[[Truth], None] | None = None,
     ) -> None:
         config = self._config = merge_fault_spans(config)
-        vehicle_seed, camera_seed, channel_seed, inertial_seed = np.random.SeedSequence(config.sim.seed).spawn(4)
+        vehicle_seed, camera_seed, channel_seed, inertial_seed = _spawn_seeds(config)[:4]
         self.vehicle: LinearVehicle | Quadrotor
         if config.sim.plant == "quadrotor":
             self.vehicle = make_quadrotor(config, vehicle_seed, start_ns)
@@ -86,6 +89,12 @@ class Peers:
         self._on_truth = on_truth
         self._truth_ns = start_ns  # boundary of the next truth
         self._outbox: deque[Due] = deque()  # in order of time
+        self._radio: SharedRadio | None = None
+        self._number = 0  # on the radio
+
+    def join_radio(self, radio: SharedRadio, number: int) -> None:
+        """Give all positions to a radio from now on, as those of its vehicle `number`."""
+        self._radio, self._number = radio, number
 
     @property
     def now_ns(self) -> int:
@@ -129,8 +138,25 @@ class Peers:
         at_ns = self._run_next_events(to_ns)
         for arrival_ns, link, data in self._take_due(at_ns):
             for answer in handle(link, data, arrival_ns).answers:
+                self._report(answer.link, answer.data, arrival_ns)
                 self.receive(answer.link, answer.data, at_ns)
         return at_ns
+
+    @property
+    def next_position_ns(self) -> int | None:
+        """Time at which the channel delivers the next position [ns]; None if none is under way."""
+        return self.channel.next_ns
+
+    def deliver_positions(self, to_ns: int, handle: Handler) -> None:
+        """Pass on the positions that arrive up to and including `to_ns`, without moving time on."""
+        for arrival_ns, data in self.channel.pop_due(to_ns):
+            for answer in handle(self._mocap_link, data, arrival_ns).answers:
+                self._report(answer.link, answer.data, arrival_ns)
+
+    def _report(self, link: str, data: bytes, at_ns: int) -> None:
+        """Send what answers a position back over the radio."""
+        if self._radio is not None and link == self._mocap_link:
+            self._radio.add_report(self._number, at_ns, data)
 
     def exchange(self, to_ns: int, handle: Handler) -> None:
         """Advance time and pass on every datagram in order of time; see `exchange_next`."""
@@ -224,10 +250,18 @@ class Peers:
     def _capture_position(self, at_ns: int) -> None:
         vehicle = self.vehicle
         sample = self.cameras.capture(vehicle.position_m, vehicle.velocity_mps, vehicle.attitude)
-        if sample is None:
+        if self._radio is not None:
+            if sample is not None:
+                self._radio.add_position(self._number, *sample)
+        elif sample is None:
             self.channel.skip_packet(at_ns)
-        else:  # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
-            self.channel.push(*sample, is_certain=self._airborne and not self.channel.counters.sent)
+        else:
+            self.send_position(*sample)
+
+    def send_position(self, at_ns: int, data: bytes) -> None:
+        """Put a position on the channel to the controller."""
+        # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
+        self.channel.push(at_ns, data, is_certain=self._airborne and not self.channel.counters.sent)
 
     def _advance_vehicle(self, to_ns: int) -> None:
         while self._truth_ns < to_ns:
@@ -239,6 +273,27 @@ class Peers:
         self._truth_ns += self.vehicle.model.dt_ns
         if self._on_truth is not None:
             self._on_truth(self.read_truth())
+
+
+def _spawn_seeds(config: Config) -> list[np.random.SeedSequence]:
+    """Return the seeds of vehicle, cameras, channel of positions, inertial sensors, and channel of reports."""
+    return np.random.SeedSequence(config.sim.seed).spawn(5)
+
+
+def _make_shared_radio(configs: Sequence[Config], peers: Sequence[Peers], sender: Sender, start_ns: int) -> SharedRadio:
+    """Make the radio of a sender, which all peers join."""
+    channels = [Channel(one.link, _spawn_seeds(one)[4], start_ns, round(one.plant.dt_s * 1e9)) for one in configs]
+    radio = SharedRadio(sender, channels)
+    for number, one in enumerate(peers):
+        one.join_radio(radio, number)
+    return radio
+
+
+def _remove_turns(config: Config) -> Config:
+    """Return a configuration whose link has no turns (`scheduled`), since a sender takes them; its loss stays."""
+    if config.link.model != "scheduled":
+        return config
+    return msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, model="bernoulli"))
 
 
 def make_quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Quadrotor:
@@ -258,16 +313,25 @@ def make_quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) 
 class SharedSpace:
     """Peers of vehicles in one space: time moves on for all of them, and they act on each other as `Interactions` says.
 
-    Their events are run in order of time, those of one time by the vehicle's number. A vehicle alone is left to itself.
+    Their events are run in order of time, those of one time by the vehicle's number, then those of the radio that they
+    share. A vehicle alone is left to itself.
+
+    Args:
+        radio: the radio that all peers have joined, which acts in `exchange`; None: positions go their own ways.
 
     Raises:
         ConfigError: vehicles touch at the start.
     """
 
     def __init__(
-        self, configs: Sequence[Config], peers: Sequence[Peers], on_collision: OnCollision | None = None
+        self,
+        configs: Sequence[Config],
+        peers: Sequence[Peers],
+        on_collision: OnCollision | None = None,
+        radio: SharedRadio | None = None,
     ) -> None:
         self.peers = tuple(peers)
+        self._radio = radio
         self._interactions = None
         if len(peers) > 1:
             bodies = [
@@ -314,10 +378,18 @@ class SharedSpace:
         waiting = {number: peers.next_action_ns for number, peers in enumerate(self.peers)}
         while waiting:
             number = min(waiting, key=lambda each: (min(waiting[each], to_ns), each))
+            self._run_radio(min(waiting[number], to_ns) - 1, handlers)
             if self.peers[number].exchange_next(to_ns, handlers[number]) >= to_ns:
                 del waiting[number]
             else:
                 waiting[number] = self.peers[number].next_action_ns
+        self._run_radio(to_ns, handlers)
+
+    def _run_radio(self, to_ns: int, handlers: Sequence[Handler]) -> None:
+        if self._radio is not None:
+            self._radio.run(
+                to_ns, self.peers, lambda number, at_ns: self.peers[number].deliver_positions(at_ns, handlers[number])
+            )
 
 
 @dataclass(frozen=True)
@@ -342,6 +414,7 @@ class FleetWorld:
             same tick and Δt.
         on_progress: gets the seconds flown so far, after every Δt.
         on_collision: gets every collision.
+        sender: sends all positions over one channel; the links act on what it sends, without `scheduled` turns.
         start_ns: time of tick 0.
         airborne: whether the vehicles begin in the air, armed and in their external mode; else on the floor, disarmed.
 
@@ -355,10 +428,11 @@ class FleetWorld:
         on_progress: Callable[[float], None] | None = None,
         on_collision: OnCollision | None = None,
         *,
+        sender: Sender | None = None,
         start_ns: int = 0,
         airborne: bool = True,
     ) -> None:
-        configs = [seat.config for seat in seats]
+        configs = [seat.config if sender is None else _remove_turns(seat.config) for seat in seats]
         _check_equal_grids(configs)
         first = configs[0]
         self._flyers = tuple(seat.flyer for seat in seats)
@@ -369,15 +443,16 @@ class FleetWorld:
         self._ticks = 0
         all_peers = [
             Peers(
-                seat.config,
+                config,
                 start_ns,
                 airborne=airborne,
-                shared_link=seat.config.daemon.vehicle == seat.config.daemon.mocap,
+                shared_link=config.daemon.vehicle == config.daemon.mocap,
                 on_truth=seat.on_truth,
             )
-            for seat in seats
+            for config, seat in zip(configs, seats, strict=True)
         ]
-        self.space = SharedSpace(configs, all_peers, on_collision)
+        radio = None if sender is None else _make_shared_radio(configs, all_peers, sender, start_ns)
+        self.space = SharedSpace(configs, all_peers, on_collision, radio)
 
     def run(self, duration_s: float, is_done: Callable[[], bool] = lambda: False) -> None:
         """Fly all the ticks that begin within `duration_s` from the start, or until the flyers are done."""

@@ -11,16 +11,21 @@ from typing import Protocol
 
 from logs.recording.ends import put_header
 from logs.recording.recorder import BatchRecorder, DerivedTopics, RecorderStatus
+from logs.recording.sender import SenderRecording
 from logs.recording.topics import ENDED
 from logs.recording.views import ViewBuilder
 from sim.simulation import COLLISION_FAULT, FleetWorld, Seat
 from uavctl.cause import Cause
+from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.types import Config
-from uavctl.errors import ConfigError, UsageError
+from uavctl.errors import ConfigError, RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.records import ClosestApproach, Collision, FleetTruth, Received, Send, Ticked, Truth, VehicleTruth
 from uavctl.wiring.controller import Prepared
+from uavctl.wiring.radio import RadioConfig, find_radio_problems
+from uavctl.wiring.sender import PositionSender, SentPosition
 
+_DATAGRAMS = "udpin://"  # kind of the cameras' URL: each datagram is whole
 TRUTH = "/sim/truth"
 FLEET_TRUTH = "/sim/fleet"
 COLLISION = "/sim/collision"
@@ -124,6 +129,50 @@ class _WorldRecord:
         return self._recorder.close()
 
 
+class RecordedSender:
+    """Sender of the positions of a fleet over one radio, as `uavctl cameras` runs it, with its recording.
+
+    Args:
+        prepared: the controllers, one a vehicle.
+        spacing_m: distance that two vehicles keep [m]; nearer ones are served more often (schedule `value`).
+        path: the recording, which must not exist; a vehicle's name in it is `vehicle-ID`, with the system id.
+
+    Raises:
+        ConfigError: the radio has no budget, or its longest wait is too short for all vehicles.
+        RecordingError: the recording cannot be made.
+    """
+
+    def __init__(self, prepared: Sequence[Prepared], radio: RadioConfig, spacing_m: float, path: Path) -> None:
+        if problems := [*find_radio_problems(radio, len(prepared))]:
+            raise ConfigError(tuple(f"{problem.key}: {problem.reason}; {problem.todo}" for problem in problems))
+        if not radio.has_budget:
+            raise ConfigError(("radio: has no budget; give bytes_per_s or messages_per_s",))
+        configs = [one.config for one in prepared]
+        sender = PositionSender(configs, [_DATAGRAMS] * len(configs), radio, spacing_m=spacing_m, start_ns=0)
+        self._sender = sender
+        self.receive_positions, self.receive_reports = sender.receive_positions, sender.receive_reports
+        self.compute_remaining_ns = sender.compute_remaining_ns
+        names = [f"vehicle-{config.sim.system_id}" for config in configs]
+        self._recording = SenderRecording(path, names, VIRTUAL_ZERO_UTC_NS)
+
+    def send_next(self, at_ns: int) -> SentPosition | None:
+        """Return and record the position that goes out now; see `PositionSender`."""
+        sent = self._sender.send_next(at_ns)
+        if sent is not None:
+            self._recording.add(at_ns, sent.vehicle, sent.captured_ns, len(sent.frame), sent.ages_s)
+        return sent
+
+    def close(self) -> None:
+        """End the recording.
+
+        Raises:
+            RecordingError: It lacks messages.
+        """
+        self._recording.__exit__(None, None, None)
+        if self._recording.failure:
+            raise RecordingError(f"sender.mcap lacks messages ({self._recording.failure}); see to the disk")
+
+
 class LockstepFleet:
     """Flights of several vehicles in one world, each with its own loop and recording; bit-identical for their seeds.
 
@@ -141,6 +190,7 @@ class LockstepFleet:
         paths: their recordings, which must not exist.
         world_path: recording of the truth of all; None for none.
         command: see `put_header`.
+        sender: sends the positions of all over one radio; None: each has its own link.
     """
 
     def __init__(
@@ -149,11 +199,13 @@ class LockstepFleet:
         paths: Sequence[Path],
         world_path: Path | None = None,
         command: str | None = None,
+        sender: RecordedSender | None = None,
     ) -> None:
         ids = [one.config.sim.system_id for one in prepared]
         if len(set(ids)) < len(ids):
             raise ConfigError((f"sim.system_id: vehicles of one world share one ({ids}); give each its own",))
         self._prepared, self._command, self._ids = tuple(prepared), command, ids
+        self._sender = sender
         self._recorders = tuple(
             BatchRecorder(path, one.config.log, derived_topics=DerivedTopics(ViewBuilder()))
             for one, path in zip(prepared, paths, strict=True)
@@ -207,7 +259,7 @@ class LockstepFleet:
             Seat(one.config, virtual_loop, partial(self._record_truth, number))
             for number, (one, virtual_loop) in enumerate(zip(self._prepared, virtual_loops, strict=True))
         ]
-        world = FleetWorld(seats, check_continued, self._record_collision, airborne=not lands)
+        world = FleetWorld(seats, check_continued, self._record_collision, sender=self._sender, airborne=not lands)
         self._begin(ends_in_flight=not lands)
         began_s = time.perf_counter()
         try:
@@ -314,6 +366,7 @@ class FlownFleet:
     statuses: tuple[RecorderStatus, ...]  # of these recordings
     collisions: tuple[Collision, ...]  # in order of time
     closest_approaches: tuple[ClosestApproach, ...]  # one a pair
+    sender_path: Path | None = None  # recording of the sender of all positions; None without a radio
 
 
 def fly_fleet(
@@ -322,16 +375,39 @@ def fly_fleet(
     *,
     observers: Sequence[TickObserver | None] | None = None,
     landing_s: float | None = None,
+    radio: RadioConfig | None = None,
+    spacing_m: float = 0.0,
 ) -> FlownFleet:
     """Fly vehicles in one world and virtual time, into recordings in a folder; see `LockstepFleet`.
 
-    The recordings are `vehicle-ID/flight.mcap`, with the system id, and `world.mcap`.
+    The recordings are `vehicle-ID/flight.mcap`, with the system id, `world.mcap` and, with a radio, `sender.mcap`.
+
+    Args:
+        prepared: the controllers; with a radio, of configurations with the overrides of `make_link_overrides`.
+        observers: see `LockstepFleet.fly`.
+        landing_s: see `LockstepFleet.fly`.
+        radio: one channel for the positions of all, with its budget and schedule. What it sends is lost and delayed by
+            each vehicle's `[link]`, and so are the reports (`source.report`).
+        spacing_m: see `RecordedSender`.
     """
     paths = tuple(folder / f"vehicle-{one.config.sim.system_id}" / "flight.mcap" for one in prepared)
-    world_path = folder / "world.mcap"
-    fleet = LockstepFleet(prepared, paths, world_path)
+    world_path, sender_path = folder / "world.mcap", folder / "sender.mcap"
+    sender = None if radio is None else RecordedSender(prepared, radio, spacing_m, sender_path)
     try:
-        fleet.fly(lambda _: True, observers=observers, landing_s=landing_s)
+        fleet = LockstepFleet(prepared, paths, world_path, sender=sender)
+        try:
+            fleet.fly(lambda _: True, observers=observers, landing_s=landing_s)
+        finally:
+            statuses = fleet.close()
     finally:
-        statuses = fleet.close()
-    return FlownFleet(fleet.loops, paths, world_path, statuses, fleet.collisions, fleet.closest_approaches)
+        if sender is not None:
+            sender.close()
+    return FlownFleet(
+        fleet.loops,
+        paths,
+        world_path,
+        statuses,
+        fleet.collisions,
+        fleet.closest_approaches,
+        None if radio is None else sender_path,
+    )
