@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
 import sys
 import threading
-from contextlib import ExitStack
+import time
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from operation_rig import reserve_port
+from patience import wait_until
 from places import ROOT
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.sender import TOPIC
 from sim.fleet import make_fleet
 from sim.server import serve_all
 from uavctl.cli.app import run
+from uavctl.cli.fleet import read_fleet
 from uavctl.config import load_config
+from uavctl.io.key_file import new_key, read_key
+from uavctl.io.signed_connection import sign_connections
+from uavctl.io.transport import open_connection
 from uavctl.mavlink.codec import decode
+from uavctl.mavlink.connection import MOCAP, make_links
+from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.messages import Position
-from uavctl.records import Vec3
+from uavctl.mavlink.signing import FrameSigner, SigningTimestamps
+from uavctl.records import PositionSample, Vec3
 
 COUNT = 4
 
@@ -92,21 +103,128 @@ def _read_positions(daemon: socket.socket) -> list[Vec3]:
     ("old", "new", "expected_text"),
     [
         ("bytes_per_s = 5760", "", "has no budget"),
-        ("loss = 0.3", "signed = true", "radio.signed"),
+        ("loss = 0.3", "signed = true", "south-west: security.key_file: is missing, and radio.signed"),
+        ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "udpin://0.0.0.0:14660"', "is that of south-west too"),
+        ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "udpin://0.0.0.0:14660/2"', "takes all of"),
+        ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "udpin://0.0.0.0:14661/x"', "south-east: cameras: "),
+        ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "natnet://10.0.0.5"', "south-east: cameras: "),
+        ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "garbage"', "south-east: cameras: "),
+        ('cameras = "udpin://0.0.0.0:14661"', 'positions = "udpout://127.0.0.1:14560"', "that of south-west too"),
+        ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "udpin://1.2.3.4:14661"', "south-east: cameras: "),
+        ("set = [", 'set = ["source.system_id=17",', "south-west: source.system_id: 17"),
+        ("set = [", """set = ['source.messages=["ODOMETRY"]',""", "south-west: source.messages: leaves out VISION"),
+        ("set = [", 'set = ["security.key_file=/etc/key",', "south-west: security.require: `mocap` must be signed"),
+        ("rate_hz = 50", "rate_hz = 0", "radio.rate_hz"),
+        ("bytes_per_s = 5760", "bytes_per_s = -1", "radio.bytes_per_s"),
+        ("bytes_per_s = 5760", "bytes_per_s = true", "radio.bytes_per_s"),
+        ("bytes_per_s = 5760", "bytes_per_sec = 5760", "bytes_per_sec"),
+        ("loss = 0.3", "loss = 1.0", "radio.loss"),
+        ("loss = 0.3", "max_wait_s = 0.03", "radio.max_wait_s"),
+        ("loss = 0.3", "signed = 1", "radio.signed"),
         ('cameras = "udpin://0.0.0.0:14660"', "", "south-west: cameras"),
         ('mocap = "udpin://0.0.0.0:14560"', 'mocap = "tcp://127.0.0.1:1"', "south-west: positions"),
         ('schedule = "value"', 'schedule = "best"', "radio.schedule"),
     ],
 )
-def test_a_fleet_that_cannot_be_served_is_refused_before_anything_is_opened(
+def test_a_fleet_that_cannot_be_served_is_refused_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, expected_text: str
 ) -> None:
     text = (ROOT / "docs" / "examples" / "radio.toml").read_text()
     assert old in text
     (tmp_path / "fleet.toml").write_text(text.replace(old, new))
     assert run(["cameras", str(tmp_path / "fleet.toml"), "--out", str(tmp_path / "new")]) == 2
-    assert expected_text in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert expected_text in error and "fleet.toml" in error
     assert not (tmp_path / "new").exists()
+
+
+def test_signed_positions_are_taken_with_the_vehicles_key_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One port of MAVLink with two bodies; a key for each vehicle; daemons' links that ask for the time."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "sender"))
+    keys = [tmp_path / f"{name}.key" for name in ("west", "east")]
+    for key in keys:
+        new_key(key)
+    with ExitStack() as stack:
+        daemons = [stack.enter_context(closing(open_connection("udpin://127.0.0.1:0"))) for _ in keys]
+        with reserve_port() as reserved:
+            port = reserved.getsockname()[1]
+        tables = []
+        for number, (daemon, key) in enumerate(zip(daemons, keys, strict=True)):
+            with socket.socket(fileno=os.dup(daemon.fileno())) as bound:
+                mocap = f"udpin://127.0.0.1:{bound.getsockname()[1]}"
+            low, high = (-2.5, -0.2) if number == 0 else (0.2, 2.5)
+            settings = [
+                f"security.key_file={key}",
+                f"sets.state_lower=[-3,-1.5,-inf,{low},-1.5,-inf,-2.5,-1,-inf]",
+                f"sets.state_upper=[3,1.5,inf,{high},1.5,inf,0,1,inf]",
+                f"target.position_m=[0,{0.5 * (low + high)},-1.2]",
+            ]
+            tables.append(
+                f'[[vehicle]]\nname = "v{number}"\nconfig = "room-px4"\nvehicle = "udpin://127.0.0.1:{24541 + number}"'
+                f'\nmocap = "{mocap}"\ncameras = "udpin://127.0.0.1:{port}/{11 + number}"'
+                f"\nset = {json.dumps(settings)}\n"
+            )
+        file = tmp_path / "fleet.toml"
+        radio = "[radio]\nbytes_per_s = 5760\nsigned = true\nfeedback_s = 0.2\n"
+        file.write_text(f"spacing_m = 0.3\n{radio}" + "".join(tables))
+        configs = [member.config for member in read_fleet(file).members]
+        links = [make_links(config)[MOCAP] for config in configs]
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "daemons"))
+        signed = [
+            stack.enter_context(sign_connections({MOCAP: daemon}, config.security))[MOCAP]
+            for daemon, config in zip(daemons, configs, strict=True)
+        ]
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "sender"))
+        samples: list[list[PositionSample]] = [[], []]
+        done = threading.Event()
+
+        def serve() -> None:
+            """Both bodies at 50 Hz, and what the daemons do with their links."""
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bridge:
+                while not done.wait(0.02):
+                    for system in (11, 12):
+                        message = mavlink.MAVLink_vision_position_estimate_message(
+                            time.monotonic_ns() // 1000, 0.1 * system, 0, -1, 0, 0, 0
+                        )
+                        bridge.sendto(message.pack(mavlink.MAVLink(None, system, 197)), ("127.0.0.1", port))
+                    for number, (link, connection) in enumerate(zip(links, signed, strict=True)):
+                        for data, at_ns in connection.receive():
+                            result = link.receive(data, at_ns)
+                            samples[number] += [item for item in result.items if isinstance(item, PositionSample)]
+                            for reply in result.replies:
+                                connection.send(reply)
+                        for frame in link.due(time.monotonic_ns()) if samples[number] else ():
+                            connection.send(frame)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            assert run(["cameras", str(file), "--duration", "3", "--out", str(tmp_path / "out"), "--json"]) == 0
+        finally:
+            done.set()
+            thread.join()
+        for number, (link, connection) in enumerate(zip(links, signed, strict=True)):
+            assert len(samples[number]) > 50
+            norths_m = [sample.position_m[0] for sample in samples[number]]
+            assert norths_m == pytest.approx([0.1 * (11 + number)] * len(norths_m))
+            assert link.stats(0).clock_source == "timesync"
+            assert not connection.refused
+        # A vehicle with another key takes none.
+        stranger = FrameSigner(read_key(keys[1]), 1, SigningTimestamps(), time.time_ns() - time.monotonic_ns())
+        with closing(open_connection(f"udpout://{configs[0].daemon.mocap.removeprefix('udpin://')}")) as other:
+            other.send(
+                stranger.sign(
+                    Encoder(246, 197).encode_position(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), time.monotonic_ns()
+                )
+            )
+            wait_until(lambda: not signed[0].receive() and signed[0].refused["forged"] == 1, "it is refused")
+    with (tmp_path / "out" / "sender.mcap").open("rb") as recording:
+        records = [json.loads(message.data) for _, _, message in make_reader(recording).iter_messages(topics=[TOPIC])]
+    assert max(record["bytes"] for record in records) <= 57
+    # With reports each age is known, and not only believed.
+    assert max(max(record["ages_s"].values()) for record in records[-20:]) < 0.2
 
 
 def test_ctrl_c_ends_it_with_a_whole_recording(tmp_path: Path) -> None:

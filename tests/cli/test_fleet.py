@@ -150,9 +150,9 @@ def test_each_vehicle_is_designed_for_the_radio(tmp_path: Path) -> None:
     members = read_fleet(make_radio_file(tmp_path, 'schedule = "round-robin"', "messages_per_s = 60", count=4)).members
     for member in members:
         link, source = member.config.link, member.config.source
-        # 4 turns of 1/60 s are longer than the cameras' period: the channel is never idle
+        # 4 turns of 1/60 s are longer than the cameras' period: the channel is never idle. An answer may lie between.
         assert (link.model, link.loss, source.rate_hz) == ("scheduled", 0.3, 50.0)
-        assert link.wait_s == pytest.approx(4 / 60)
+        assert link.wait_s == pytest.approx(5 / 60)
         assert build_ages(member.config).outage(member.config.smpc.horizon) < 1e-6
 
 
@@ -164,8 +164,9 @@ def test_more_vehicles_mean_more_risk_and_too_many_are_not_carried(
     radio = json.loads(capsys.readouterr().out)["radio"]
     silences = [load["silence_probability"] for load in radio["loads"]]
     assert silences == sorted(silences)
-    # Of 0.44 s each: within the horizon of 2.4 s, less 0.09 s on the way, 5 turns of one vehicle, 2 of two, 1 of three
-    assert silences[:3] == pytest.approx([0.3**5, 0.3**2, 0.3])
+    # Of 0.44 s each, with an answer of 0.28 s between: within the horizon of 2.4 s, less 0.09 s on the way, 3 turns of
+    # one vehicle, 1 of two, 1 of three
+    assert silences[:3] == pytest.approx([0.3**3, 0.3, 0.3])
     assert radio["carried"] == 1
 
 

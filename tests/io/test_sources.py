@@ -267,7 +267,7 @@ def test_a_daemon_that_does_not_read_finds_the_newest_and_how_many_were_dropped(
         server.bind(("127.0.0.1", 0))
         theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8192)
         camera = Counting()
-        host = CameraHost(camera, theirs, server.getsockname(), "127.0.0.1")
+        host = CameraHost({"drone": camera}, theirs, server.getsockname(), "127.0.0.1")
         thread = threading.Thread(target=host.run)
         thread.start()
         with ours, closing(host):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlsplit
@@ -17,14 +18,20 @@ from uavctl.cli.fleet import Fleet, Member, read_fleet
 from uavctl.cli.output import make_table, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import monotonic_ns, read_zero_utc_ns
-from uavctl.errors import ConfigError
+from uavctl.config.connections import CAMERA_SYSTEM_ID
+from uavctl.config.types import Config
+from uavctl.errors import ConfigError, ConnectionSpecError
+from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
-from uavctl.io.signed_connection import make_admission_rules
-from uavctl.io.sources import open_source
+from uavctl.io.camera_process import PROCESS_ENDED
+from uavctl.io.shared_sources import SharedSource, find_shared_sources, split_source_url
+from uavctl.io.signed_connection import make_admission_rules, sign_sender
+from uavctl.io.sources import open_bodies
 from uavctl.io.transport import open_connection, wait
 from uavctl.mavlink.connection import MOCAP
-from uavctl.wiring.sender import PositionSender
+from uavctl.wiring.sender import PositionSender, SentPosition
 
+SENT_MESSAGE = "VISION_POSITION_ESTIMATE"
 MAX_SLEEP_NS = 50_000_000  # so that a signal ends the command soon
 
 
@@ -46,31 +53,27 @@ def cameras(
     problems = list(_find_problems(file, fleet))
     if problems:
         raise ConfigError(tuple(problems))
-    start_ns = monotonic_ns()
+    names = [member.name for member in fleet.members]
+    sources = find_shared_sources([member.cameras for member in fleet.members])
     sender = PositionSender(
         [member.config for member in fleet.members],
-        [member.cameras for member in fleet.members],
+        sources,
         fleet.radio,
         spacing_m=fleet.spacing_m,
-        start_ns=start_ns,
+        start_ns=monotonic_ns(),
     )
-    names = [member.name for member in fleet.members]
     path = make_recording_path(out, file.stem).with_name("sender.mcap")
     with (
+        _open_connections(file, fleet, sources) as (source_links, target_links),
         SenderRecording(path, names, read_zero_utc_ns()) as recording,
-        _open_connections(fleet) as connections,
         stop_on_signals() as stopped,
     ):
         print_message(f"sending the positions of {len(names)} vehicles, recording to {path}; Ctrl-C ends it")
+        run = _Run(fleet, sender, recording, source_links, target_links)
         end_ns = None if duration is None else monotonic_ns() + round(duration * 1e9)
-        closed: set[str] = set()
         while not stopped() and (end_ns is None or monotonic_ns() < end_ns):
-            _run_once(sender, connections, recording)
-            for name in {name for name, connection in connections.items() if connection.closed} - closed:
-                closed.add(name)
-                direction, _, number = name.partition(" ")
-                side = "source" if direction == "from" else "link"
-                print_message(f"{names[int(number)]}: its {side} is closed: {connections[name].url}")
+            run.run_once()
+            run.report()
     if recording.failure:
         print_message(f"{path}: the recording lacks positions ({recording.failure}); see to the disk")
     if sender.refused:
@@ -83,35 +86,124 @@ def cameras(
     return 0 if all(counts.values()) and not recording.failure else 1
 
 
-def _run_once(sender: PositionSender, connections: dict[str, Connection], recording: SenderRecording) -> None:
-    """Send what is due, then wait for data or for the channel."""
-    at_ns = monotonic_ns()
-    sent = sender.send_next(at_ns)
-    if sent is not None:
-        connections[f"to {sent.vehicle}"].send(sent.frame)
-        recording.add(at_ns, sent.vehicle, sent.captured_ns, len(sent.frame), sent.ages_s)
-    remaining_ns = sender.compute_remaining_ns(at_ns) or MAX_SLEEP_NS
-    for name in wait(connections, at_ns + min(remaining_ns, MAX_SLEEP_NS), monotonic_ns):
-        direction, _, number = name.partition(" ")
-        receive = sender.receive_positions if direction == "from" else sender.receive_reports
-        for data, received_ns in connections[name].receive():
-            receive(int(number), data, received_ns)
+class _Run:
+    """A sender at work: connections, recording, and what people are told."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        sender: PositionSender,
+        recording: SenderRecording,
+        sources: list[Connection],
+        targets: list[Connection],
+    ) -> None:
+        self._fleet, self._sender, self._recording = fleet, sender, recording
+        self._sources, self._targets = sources, targets
+        self._connections = {f"from {number}": source for number, source in enumerate(sources)}
+        self._connections |= {f"to {number}": target for number, target in enumerate(targets)}
+        self._told: set[str] = set()
+        self._silent: set[int] = set()
+
+    def run_once(self) -> None:
+        """Send what is due, then wait for data or for the channel."""
+        at_ns = monotonic_ns()
+        sent = self._sender.send_next(at_ns)
+        if sent is not None:
+            self._targets[sent.vehicle].send(sent.frame)
+        if isinstance(sent, SentPosition):
+            self._recording.add(at_ns, sent.vehicle, sent.captured_ns, sent.wire_bytes, sent.ages_s)
+        for number, source in enumerate(self._sources):
+            request = self._sender.make_time_request(number, at_ns)
+            if request is not None:
+                source.send(request)
+        remaining_ns = self._sender.compute_remaining_ns(at_ns) or MAX_SLEEP_NS
+        for name in wait(self._connections, at_ns + min(remaining_ns, MAX_SLEEP_NS), monotonic_ns):
+            direction, _, number_text = name.partition(" ")
+            number, connection = int(number_text), self._connections[name]
+            for index, (data, received_ns) in enumerate(connection.receive()):
+                if direction == "to":
+                    self._sender.receive_reports(number, data, received_ns)
+                elif self._sender.receive_positions(number, data, received_ns):
+                    connection.trust_sender(index)
+
+    def report(self) -> None:
+        """Tell people of vehicles without positions, closed connections, ended processes and a full disk, once each."""
+        silent, members = self._sender.find_silent(monotonic_ns()), self._fleet.members
+        for number in silent - self._silent:
+            print_message(f"{members[number].name}: no position for 1 s from {members[number].cameras}")
+        for number in self._silent - silent:
+            print_message(f"{members[number].name}: positions again")
+        self._silent = silent
+        for name, connection in self._connections.items():
+            side = "source" if name.startswith("from") else "link"
+            if connection.closed:
+                self._tell_once(f"{side} {connection.url} is closed")
+            for reason in connection.refused:
+                if reason.startswith(PROCESS_ENDED):
+                    self._tell_once(f"{side} {connection.url}: {reason}")
+        if self._recording.failure:
+            self._tell_once(f"the recording lacks positions from now on ({self._recording.failure}); see to the disk")
+
+    def _tell_once(self, text: str) -> None:
+        if text not in self._told:
+            self._told.add(text)
+            print_message(text)
 
 
 def _find_problems(path: Path, fleet: Fleet) -> Iterator[str]:
     if not fleet.radio.has_budget:
         yield f"{path}: radio: is missing; give bytes_per_s or messages_per_s of the channel"
-    if fleet.radio.signed:
-        yield f"{path}: radio.signed: the sender does not sign; leave it out"
     for member in fleet.members:
-        security = member.config.security
+        where = f"{path}: {member.name}"
         if not member.cameras:
-            yield f"{path}: {member.name}: cameras: is missing; give the source of its positions, as for --mocap"
+            yield f"{where}: cameras: is missing; give the source of its positions, as for --mocap"
         if not _find_target_url(member):
             url = member.config.daemon.mocap
-            yield f"{path}: {member.name}: positions: is missing, and {url} is no UDP port; give the URL to send to"
-        if security.key_file and MOCAP in security.require:
-            yield f"{path}: {member.name}: security.require: the sender does not sign; leave out `mocap`"
+            yield f"{where}: positions: is missing, and {url} is no UDP port; give the URL to send to"
+        yield from (f"{where}: {text}" for text in _find_daemon_problems(member.config, signed=fleet.radio.signed))
+    yield from (f"{path}: {text}" for text in _find_shared_problems(fleet))
+
+
+def _find_daemon_problems(config: Config, *, signed: bool) -> Iterator[str]:
+    """Yield why a vehicle's daemon would not take the sender's messages."""
+    security, source = config.security, config.source
+    if signed and not security.key_file:
+        yield "security.key_file: is missing, and radio.signed needs it; give the vehicle's, or leave out radio.signed"
+    elif signed and MOCAP not in security.require:
+        yield "security.require: lacks `mocap`, so signatures are not compared; add it, or leave out radio.signed"
+    elif security.key_file and MOCAP in security.require and not signed:
+        yield "security.require: `mocap` must be signed; write signed = true in [radio], or leave out `mocap`"
+    if SENT_MESSAGE not in source.messages:
+        yield f"source.messages: leaves out {SENT_MESSAGE}, which the sender sends; add it"
+    if source.system_id not in (0, CAMERA_SYSTEM_ID):
+        yield (
+            f"source.system_id: {source.system_id} is another system than the sender, {CAMERA_SYSTEM_ID}; give "
+            f"{CAMERA_SYSTEM_ID} or 0, and the cameras' system id behind the port in `cameras`"
+        )
+
+
+def _find_shared_problems(fleet: Fleet) -> Iterator[str]:
+    """Yield what is wrong with the sources, and where two vehicles would have the same body or receiver."""
+    name_by_body: dict[tuple[object, str], str] = {}
+    name_by_target: dict[str, str] = {}
+    for member in fleet.members:
+        target = _find_target_url(member)
+        other = name_by_target.setdefault(target, member.name)
+        if target and other != member.name:
+            yield f"{member.name}: positions: {target} is that of {other} too; give each vehicle a URL of its own"
+        if not member.cameras:
+            continue
+        try:
+            connection, body = split_source_url(member.cameras)
+        except ConnectionSpecError as error:
+            yield f"{member.name}: cameras: {error}"
+            continue
+        other = name_by_body.setdefault((connection, body), member.name)
+        if other != member.name:
+            remedy = "another body" if body else "the body behind it, as /1 for MAVLink system 1,"
+            yield f"{member.name}: cameras: {member.cameras} is that of {other} too; give {remedy} or another source"
+        elif body and (connection, "") in name_by_body:
+            yield f"{member.name}: cameras: {name_by_body[connection, '']} takes all of {connection}; name its body too"
 
 
 def _find_target_url(member: Member) -> str:
@@ -126,14 +218,46 @@ def _find_target_url(member: Member) -> str:
 
 
 @contextmanager
-def _open_connections(fleet: Fleet) -> Iterator[dict[str, Connection]]:
-    """Open the source of each vehicle, and the connection to its daemon."""
+def _open_connections(
+    path: Path, fleet: Fleet, sources: tuple[SharedSource, ...]
+) -> Iterator[tuple[list[Connection], list[Connection]]]:
+    """Open the sources, and the connection to each vehicle's daemon."""
     with ExitStack() as stack:
-        connections: dict[str, Connection] = {}
-        for number, member in enumerate(fleet.members):
-            rules = make_admission_rules(member.config.security)
-            source = connections[f"from {number}"] = open_source(member.cameras, monotonic_ns, rules)
-            stack.callback(source.close)
-            target = connections[f"to {number}"] = open_connection(_find_target_url(member), monotonic_ns, rules)
+        source_links: list[Connection] = []
+        for source in sources:
+            first = fleet.members[min(source.addresses)]
+            rules = make_admission_rules(first.config.security)
+            with _name_key(f"{path}: {first.name}: cameras"):
+                source_links.append(_open_source(source, rules))
+            stack.callback(source_links[-1].close)
+        target_links: list[Connection] = []
+        for member in fleet.members:
+            security = member.config.security
+            with _name_key(f"{path}: {member.name}: positions"):
+                target = open_connection(_find_target_url(member), monotonic_ns, make_admission_rules(security))
             stack.callback(target.close)
-        yield connections
+            target_links.append(stack.enter_context(sign_sender(target, security)) if fleet.radio.signed else target)
+        yield source_links, target_links
+
+
+def _open_source(source: SharedSource, rules: AdmissionRules) -> Connection:
+    count = len(source.addresses)
+    # The rules are those for one vehicle.
+    rules = replace(
+        rules,
+        max_per_s=count * rules.max_per_s,
+        max_frames_per_s=count * rules.max_frames_per_s,
+        max_bytes_per_s=count * rules.max_bytes_per_s,
+    )
+    if source.is_camera:
+        return open_bodies(source.urls, monotonic_ns, rules)
+    return open_connection(source.url, monotonic_ns, rules)
+
+
+@contextmanager
+def _name_key(key: str) -> Iterator[None]:
+    """Name the file and key of a URL that cannot be opened."""
+    try:
+        yield
+    except ConnectionSpecError as error:
+        raise ConnectionSpecError(f"{key}: {error}") from error

@@ -1,8 +1,9 @@
-"""Process that listens to cameras for one daemon.
+"""Process that listens to cameras for one daemon, or for the sender of several vehicles.
 
-The daemon starts it as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT BODY UP INTERFACE`.
+It is started as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT UP INTERFACE BODY...`.
 
-1. Receive data of the camera server, and encode poses and time answers as MAVLink.
+1. Receive data of the camera server, and encode poses and time answers as MAVLink. Each body has a `Camera`: all of
+   them get the data of one connection. Body n has component `COMPONENT_ID` + n.
 2. Send them to the daemon through a pair of sockets that keeps message bounds. The first byte is the kind of message.
 3. Pass time requests of the daemon on to the cameras.
 4. End when the daemon has closed its end, or has died.
@@ -20,7 +21,7 @@ import struct
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from importlib import import_module
 from typing import cast
@@ -51,10 +52,10 @@ _UNKNOWN = [math.nan, *([0.0] * 20)]
 
 
 class CameraMessageEncoder:
-    """Encoder of camera messages; numbers the frames modulo 256."""
+    """Encoder of the messages of a body by its number; numbers the frames modulo 256."""
 
-    def __init__(self) -> None:
-        self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID)
+    def __init__(self, number: int = 0) -> None:
+        self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID + number)
 
     def encode(self, item: BodyPose | Echo) -> bytes:
         """Encode a pose as ODOMETRY in axes forward, right, down; an echo as TIMESYNC with our time as token."""
@@ -106,13 +107,17 @@ class CameraHost:
     """Passes data between a camera server and the daemon.
 
     Args:
+        cameras: one for each body, by its name.
         pipe: our end of the pair of sockets.
         interface: address of our own network interface.
     """
 
-    def __init__(self, camera: Camera, pipe: socket.socket, server: tuple[str, int], interface: str) -> None:
-        self._camera, self._pipe, self._server, self._interface = camera, pipe, server, interface
-        self._encoder = CameraMessageEncoder()
+    def __init__(
+        self, cameras: Mapping[str, Camera], pipe: socket.socket, server: tuple[str, int], interface: str
+    ) -> None:
+        self._cameras, self._pipe, self._server, self._interface = cameras, pipe, server, interface
+        self._first = next(iter(cameras.values()))
+        self._encoders = [CameraMessageEncoder(number) for number in range(len(cameras))]
         self._queue: deque[bytes] = deque()
         self._dropped: Counter[str] = Counter()
         self._reported_counts: Counter[str] = Counter()
@@ -120,7 +125,7 @@ class CameraHost:
         self._is_ready = False
         self._group: tuple[str, int] | None = None
         self._group_socket: socket.socket | None = None
-        self._is_stream: bool = getattr(camera, "stream", False)
+        self._is_stream: bool = getattr(self._first, "stream", False)
         self._connected_s = time.monotonic()  # of the last attempt
         self._server_socket: socket.socket | None = self._connect(ANSWER_S)
         pipe.setblocking(False)
@@ -134,7 +139,8 @@ class CameraHost:
                 server_socket.settimeout(timeout_s)
                 server_socket.connect(self._server)
                 server_socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._camera.receive(b"", time.monotonic_ns())
+                for camera in self._cameras.values():
+                    camera.receive(b"", time.monotonic_ns())
         except OSError:
             server_socket.close()
             raise
@@ -165,8 +171,13 @@ class CameraHost:
         start_s = time.monotonic()
         while self._poll():
             if not self._is_ready and time.monotonic() - start_s > ANSWER_S:
-                raise TimeoutError(f"no {self._camera.awaits} within {ANSWER_S:g} s")
+                raise TimeoutError(self._describe_missing())
             self._report_counts()
+
+    def _describe_missing(self) -> str:
+        body, camera = next((body, camera) for body, camera in self._cameras.items() if not camera.ready)
+        name = f" for body {body!r}" if len(self._cameras) > 1 else ""
+        return f"no {camera.awaits} within {ANSWER_S:g} s{name}"
 
     def close(self) -> None:
         """Release the sockets to the server."""
@@ -179,8 +190,8 @@ class CameraHost:
         """Wait for data and pass them on; False once the daemon has gone."""
         if self._server_socket is None:
             self._reconnect()
-        for data in self._camera.due(time.monotonic_ns()):
-            self._send(data)
+        at_ns = time.monotonic_ns()
+        self._send_once(data for camera in self._cameras.values() for data in camera.due(at_ns))
         self._follow_group()
         sources = [source for source in (self._server_socket, self._group_socket) if source is not None]
         readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._queue else [], [], _POLL_S)
@@ -189,6 +200,11 @@ class CameraHost:
                 self._receive(source)
         self._flush()
         return self._pipe not in readable or self._forward_time_requests()
+
+    def _send_once(self, requests: Iterable[bytes]) -> None:
+        """Send requests; those of several bodies are alike, and one is enough."""
+        for data in dict.fromkeys(requests):
+            self._send(data)
 
     def _send(self, data: bytes) -> None:
         if self._server_socket is None or not data:
@@ -219,10 +235,11 @@ class CameraHost:
                 self._dropped[NOT_SERVER] += 1
                 continue
             messages = self._make_messages(data)
-            if self._camera.ready and not self._is_ready:  # before any position: the daemon waits for this message
+            is_ready = all(camera.ready for camera in self._cameras.values())
+            if is_ready and not self._is_ready:  # before any position: the daemon waits for this message
                 self._is_ready = True
                 self._queue_message(READY)
-            for message in messages:
+            for message in messages if self._is_ready else ():
                 self._queue_message(message)
 
     def _make_messages(self, data: bytes) -> list[bytes]:
@@ -231,13 +248,15 @@ class CameraHost:
         Raises:
             CameraError: the cameras cannot be used.
         """
-        try:
-            return [self._encoder.encode(item) for item in self._camera.receive(data, time.monotonic_ns())]
-        except CameraError:
-            raise
-        except Exception:  # noqa: BLE001 anybody may send a datagram, and the camera may be of another package
-            self._dropped[UNREADABLE] += 1
-            return []
+        at_ns, messages = time.monotonic_ns(), list[bytes]()
+        for encoder, camera in zip(self._encoders, self._cameras.values(), strict=True):
+            try:
+                messages += [encoder.encode(item) for item in camera.receive(data, at_ns)]
+            except CameraError:
+                raise
+            except Exception:  # noqa: BLE001 anybody may send a datagram, and the camera may be of another package
+                self._dropped[UNREADABLE] += 1
+        return messages
 
     def _forward_time_requests(self) -> bool:
         """Pass on the daemon's time requests; False if it has gone."""
@@ -248,7 +267,7 @@ class CameraHost:
         except OSError:
             return False
         for token in parse_time_requests(data):
-            self._send(self._camera.ask_time(token))
+            self._send_once(camera.ask_time(token) for camera in self._cameras.values())
         return bool(data)
 
     def _queue_message(self, message: bytes) -> None:
@@ -267,16 +286,19 @@ class CameraHost:
             self._queue.popleft()
 
     def _report_counts(self) -> None:
-        counts = self._camera.dropped + self._dropped
+        counts = self._dropped.copy()
+        for body, camera in self._cameras.items():
+            prefix = f"{body}: " if len(self._cameras) > 1 else ""
+            counts.update({f"{prefix}{reason}": count for reason, count in camera.dropped.items()})
         if counts != self._reported_counts and time.monotonic() - self._reported_s >= _COUNTS_PERIOD_S:
             self._reported_counts, self._reported_s = counts, time.monotonic()
             self._queue_message(COUNTS + json.dumps(counts).encode())
 
     def _follow_group(self) -> None:
         """Join the multicast group of the server, if there is one."""
-        if self._camera.group == self._group:
+        if self._first.group == self._group:
             return
-        self._group = self._camera.group
+        self._group = self._first.group
         if self._group_socket is not None:
             self._group_socket.close()
             self._group_socket = None
@@ -323,13 +345,14 @@ def _make_camera(camera: str, body: str, up: Up) -> Camera:
 
 def main(arguments: list[str]) -> int:
     """Run for the daemon that started this process."""
-    descriptor, camera, address, port, body, up, interface = arguments
+    descriptor, camera, address, port, up, interface, *bodies = arguments
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_LIMIT, _MEMORY_LIMIT))
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
     with socket.socket(fileno=int(descriptor)) as pipe:
         pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)
         try:
-            host = CameraHost(_make_camera(camera, body, cast(Up, up)), pipe, (address, int(port)), interface)
+            cameras = {body: _make_camera(camera, body, cast(Up, up)) for body in bodies}
+            host = CameraHost(cameras, pipe, (address, int(port)), interface)
             try:
                 host.run()
             finally:

@@ -6,7 +6,7 @@ import json
 import socket
 import subprocess
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from importlib.util import find_spec
 
@@ -153,14 +153,15 @@ class CameraProcessConnection(BaseConnection):
         return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
-def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Connection:
-    """Open a body of a camera system; see `open_source`.
+def _open_camera(urls: Sequence[str], now: Callable[[], int], rules: AdmissionRules) -> Connection:
+    """Open the bodies of one server of a camera system; see `open_bodies`.
 
     Raises:
-        ConnectionSpecError: the URL, the server or the body is not as it has to be.
+        ConnectionSpecError: the URL, the server or a body is not as it has to be.
         ExtraMissingError: the camera system's package is not installed.
     """
-    camera_url = parse_camera_url(url)
+    url, camera_url = urls[0], parse_camera_url(urls[0])
+    bodies = [parse_camera_url(each).body for each in urls]
     system = get_camera_system(camera_url.system)
     if system.package and find_spec(system.package) is None:  # not imported: the camera has a process of its own
         raise ExtraMissingError(system.package, system.extra)
@@ -172,7 +173,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Con
         ) from error
     if not AllowList(rules.allow).allows(address):
         raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
-    arguments = [system.camera, address, str(camera_url.port), camera_url.body, camera_url.up, camera_url.interface]
+    arguments = [system.camera, address, str(camera_url.port), camera_url.up, camera_url.interface, *bodies]
     connection = CameraProcessConnection(url, arguments, system.advice, now, rules)
     with ExitStack() as stack:
         stack.callback(connection.close)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
+from functools import lru_cache
 from ipaddress import IPv4Address
 
 import natnet
@@ -73,6 +74,11 @@ class _BoundedBuffer(natnet.PacketBuffer):
         return super().read_string(_MAX_NAME_BYTES if max_length is None else max_length, static_length)
 
 
+@lru_cache(maxsize=1)  # the cameras of several bodies read the same frame
+def _read_frame(payload: bytes, version: tuple[int, ...]) -> natnet.DataFrame:
+    return natnet.DataFrame.read_from_buffer(_BoundedBuffer(payload), natnet.Version(*version))
+
+
 class NatNet:
     """One rigid body of one server; implements `uavctl.io.camera.Camera`.
 
@@ -82,7 +88,7 @@ class NatNet:
 
     def __init__(self, body: str, up: Up) -> None:
         self._body, self._up = body, up
-        self._version: natnet.Version | None = None
+        self._version: tuple[int, ...] | None = None
         self._ticks_per_s = 0
         self._body_id: int | None = None
         self._heard_ns = self._asked_ns = self._keep_alive_ns = -_SILENT_NS
@@ -114,10 +120,10 @@ class NatNet:
                 return (Echo(token, self._ticks_to_ns(ticks)),)
             elif kind == DESCRIPTIONS and self._version is not None:
                 self._handle_descriptions(
-                    natnet.DataDescriptions.read_from_buffer(_BoundedBuffer(payload), self._version)
+                    natnet.DataDescriptions.read_from_buffer(_BoundedBuffer(payload), natnet.Version(*self._version))
                 )
             elif kind == FRAME and self._version is not None and self._is_complete:
-                return self._handle_frame(natnet.DataFrame.read_from_buffer(_BoundedBuffer(payload), self._version))
+                return self._handle_frame(_read_frame(payload, self._version))
         except _UNREADABLE:
             self.dropped[UNREADABLE] += 1
         return ()
@@ -164,7 +170,7 @@ class NatNet:
         if not ticks_per_s:
             self._refuse(f"NatNet {text} without the rate of its clock, so nobody could tell how old its frames are")
             return
-        self._info, self._version, self._ticks_per_s = payload, natnet.Version(*version), ticks_per_s
+        self._info, self._version, self._ticks_per_s = payload, version, ticks_per_s
         self._is_complete = False
         self.group = (str(IPv4Address(group)), port) if multicast else None
 

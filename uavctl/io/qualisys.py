@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
+from functools import lru_cache
+from typing import Any
 from xml.etree import ElementTree
 
 from qtm_rt.packet import QRTComponentType, QRTPacket
@@ -38,6 +40,13 @@ _MAX_COMPONENTS = 64  # a frame has one of each type, and there are some twenty 
 _SILENT_NS = 1_000_000_000
 _UNREADABLE = (struct.error, ValueError, IndexError, TypeError, KeyError, ElementTree.ParseError)
 _TOLERANCE = 1e-3
+
+
+@lru_cache(maxsize=1)  # the cameras of several bodies read the same frame
+def _read_frame(payload: bytes) -> tuple[int, list[Any] | None]:
+    """Return the stamp of a frame [µs], and place and turn of its bodies; None without any."""
+    frame = QRTPacket(payload)
+    return frame.timestamp, frame.get_6d()[1] if QRTComponentType.Component6d in frame.components else None
 
 
 class Qualisys:
@@ -122,7 +131,7 @@ class Qualisys:
             (components,) = _COMPONENTS.unpack_from(payload, _COMPONENTS_AT)
             if components > _MAX_COMPONENTS:  # the library counts them out, though each may have no bytes
                 return self._count_dropped(UNREADABLE)
-            return self._handle_frame(QRTPacket(payload))
+            return self._handle_frame(*_read_frame(payload))
         return ()
 
     def _handle_bodies(self, text: bytes) -> None:
@@ -137,10 +146,9 @@ class Qualisys:
         self._body_index, self.ready = names.index(self._body), True
         self._outgoing.append(_encode_command("StreamFrames AllFrames 6D"))
 
-    def _handle_frame(self, frame: QRTPacket) -> tuple[BodyPose, ...]:
-        if QRTComponentType.Component6d not in frame.components:
+    def _handle_frame(self, timestamp_us: int, bodies: list[Any] | None) -> tuple[BodyPose, ...]:
+        if bodies is None:
             return self._count_dropped(NO_MEASUREMENT)
-        _, bodies = frame.get_6d()
         if self._body_index is None or self._body_index >= len(bodies):
             return self._count_dropped(MISSING)
         place, rotation = bodies[self._body_index]
@@ -148,7 +156,7 @@ class Qualisys:
         if attitude is None or not all(map(math.isfinite, place)):
             return self._count_dropped(UNTRACKED)
         position_m: Vec3 = (place.x * 1e-3, place.y * 1e-3, place.z * 1e-3)
-        return (BodyPose(frame.timestamp * 1000, *convert_pose_to_frd(position_m, attitude, self._up)),)
+        return (BodyPose(timestamp_us * 1000, *convert_pose_to_frd(position_m, attitude, self._up)),)
 
     def _count_dropped(self, reason: str) -> tuple[BodyPose, ...]:
         self.dropped[reason] += 1

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from uavctl.clock import monotonic_ns
 from uavctl.config import Config
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
@@ -190,3 +192,18 @@ def sign_connections(
         yield signed
     finally:
         keeper.close()
+
+
+@contextmanager
+def sign_sender(connection: Connection, security: SecurityConfig) -> Iterator[Connection]:
+    """Sign a connection over which positions are sent to the daemon of a vehicle with this `[security]`.
+
+    Raises:
+        KeyFileError: the key or its stamp cannot be used.
+    """
+    peers = security.peer_link_ids
+    link_id = peers[0] - MOCAP_LINK if peers else security.link_id
+    with sign_connections(
+        {MOCAP: connection}, replace(security, require=(MOCAP,), link_id=link_id, peer_link_ids=())
+    ) as signed:
+        yield signed[MOCAP]

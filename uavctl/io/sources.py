@@ -17,7 +17,7 @@ positions are lost, and the controller handles that.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from uavctl.config.connections import parse_camera_scheme
 from uavctl.io.admission import AdmissionRules
@@ -38,5 +38,15 @@ def open_source(
     Raises:
         ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; names the remedy.
     """
-    opener = _open_camera if parse_camera_scheme(url) else open_connection
-    return opener(url, now, rules)
+    return _open_camera([url], now, rules) if parse_camera_scheme(url) else open_connection(url, now, rules)
+
+
+def open_bodies(
+    urls: Sequence[str], now: Callable[[], int] = time.monotonic_ns, rules: AdmissionRules = DEFAULT_RULES
+) -> Connection:
+    """Open one connection to several bodies of a camera system; `find_shared_sources` finds URLs that share one.
+
+    Raises:
+        ConnectionSpecError: as of `open_source`.
+    """
+    return _open_camera(urls, now, rules)

@@ -17,11 +17,12 @@ FRAME_OVERHEAD_BYTES = 12
 SIGNATURE_BYTES = 13
 # VISION_POSITION_ESTIMATE without its covariance: time, position and three angles (zeros at the end are not sent).
 POSITION_PAYLOAD_BYTES = 32
+TIMESYNC_PAYLOAD_BYTES = 16  # without the ids of its receiver (zeros at the end)
 
 
-def compute_frame_bytes(*, signed: bool) -> int:
-    """Return the length of a position on the wire [bytes]."""
-    return FRAME_OVERHEAD_BYTES + POSITION_PAYLOAD_BYTES + (SIGNATURE_BYTES if signed else 0)
+def compute_frame_bytes(*, signed: bool, payload_bytes: int = POSITION_PAYLOAD_BYTES) -> int:
+    """Return the length of a message on the wire [bytes]; that of a position by default."""
+    return FRAME_OVERHEAD_BYTES + payload_bytes + (SIGNATURE_BYTES if signed else 0)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from uavctl.arrays import SECOND_NS, Array
 from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.types import Config
 from uavctl.schedule.ages import compute_periodic_tail
-from uavctl.schedule.channel import Budget, compute_frame_bytes
+from uavctl.schedule.channel import TIMESYNC_PAYLOAD_BYTES, Budget, compute_frame_bytes
 from uavctl.schedule.scheduler import ScheduleName
 from uavctl.schedule.value import compute_age_costs, compute_message_values, predict_covariances
 from uavctl.smpc.estimate import add_bias
@@ -28,6 +28,8 @@ from uavctl.wiring.rest import build_weights
 # counts on the longest wait, has larger margins.
 ADAPTIVE_ROUNDS = 2
 MAX_AGE_S = 5.0  # larger ages cost as this one; a vehicle lands earlier
+# A daemon asks for the time each 0.95 s; in 8 slots of positions there is at most one answer.
+ANSWER_PERIOD_NS, ANSWER_SLOTS = 900_000_000, 8
 _TAIL_ROUNDS = 400  # rounds of the mean age's sum; the rest is below 1e-15 up to a loss of 0.9
 
 
@@ -72,10 +74,29 @@ def compute_slot_ns(radio: RadioConfig) -> int:
     return make_budget(radio).compute_slot_ns(compute_frame_bytes(signed=radio.signed))
 
 
+def compute_answer_period_ns(radio: RadioConfig, count: int) -> int:
+    """Return the least time between two answers to TIMESYNC on the channel [ns]."""
+    return max(ANSWER_PERIOD_NS // count, ANSWER_SLOTS * compute_slot_ns(radio))
+
+
+def compute_slots_s(radio: RadioConfig, count: int, slots: int) -> float:
+    """Return the longest time of so many positions on the channel [s], with the answers to TIMESYNC among them."""
+    length_bytes = compute_frame_bytes(signed=radio.signed, payload_bytes=TIMESYNC_PAYLOAD_BYTES)
+    answer_ns, period_ns = make_budget(radio).compute_slot_ns(length_bytes), compute_answer_period_ns(radio, count)
+    # W = M slot + (floor(W / period) + 1) answer; the period is 8 answers or more, so the iteration ends
+    positions_ns, wait_ns = slots * compute_slot_ns(radio), 0
+    while wait_ns != (next_ns := positions_ns + (wait_ns // period_ns + 1) * answer_ns):
+        wait_ns = next_ns
+    return wait_ns / SECOND_NS
+
+
 def compute_max_wait_slots(radio: RadioConfig, count: int) -> int:
     """Return the longest wait of a vehicle, in slots; too few for all of them if `max_wait_s` is too short."""
     if radio.max_wait_s is not None:
-        return int(radio.max_wait_s * SECOND_NS / compute_slot_ns(radio) + 1e-9)
+        slots = int(radio.max_wait_s * SECOND_NS / compute_slot_ns(radio))
+        while slots and compute_slots_s(radio, count, slots) > radio.max_wait_s + 1e-9:
+            slots -= 1
+        return slots
     return count * (1 if radio.schedule == "round-robin" else ADAPTIVE_ROUNDS)
 
 
@@ -86,7 +107,7 @@ def compute_link_wait_s(radio: RadioConfig, count: int) -> float:
     and a vehicle waits for its next position in addition.
     """
     slot_s, period_s = compute_slot_ns(radio) / SECOND_NS, 1.0 / radio.rate_hz
-    wait_s = compute_max_wait_slots(radio, count) * slot_s
+    wait_s = compute_slots_s(radio, count, compute_max_wait_slots(radio, count))
     return wait_s if count * slot_s > period_s else wait_s + period_s
 
 
@@ -98,11 +119,13 @@ def find_radio_problems(radio: RadioConfig, count: int) -> list[ConfigProblem]:
         return [ConfigProblem("radio", "has no budget", "give bytes_per_s or messages_per_s")]
     slot_s = compute_slot_ns(radio) / SECOND_NS
     if compute_max_wait_slots(radio, count) < count:
+        round_s = math.ceil(1e4 * compute_slots_s(radio, count, count)) * 1e-4
         return [
             ConfigProblem(
                 "radio.max_wait_s",
-                f"{radio.max_wait_s:g} s is too short: {count} messages of {slot_s:.4g} s take {count * slot_s:.4g} s",
-                f"give {count * slot_s:.4g} or more, a larger budget, or fewer vehicles",
+                f"{radio.max_wait_s:g} s is too short: {count} messages of {slot_s:.4g} s take up to {round_s:.4f} s "
+                "with answers to TIMESYNC",
+                f"give {round_s:.4f} or more, a larger budget, or fewer vehicles",
             )
         ]
     return []
