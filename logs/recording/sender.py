@@ -1,14 +1,25 @@
-"""Recording of a sender: one MCAP file with a JSON message for each position sent."""
+"""Recording of a sender: one MCAP file with a JSON message for each position sent; its writer and its reader."""
 
 from __future__ import annotations
 
 import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
+import msgspec
+import numpy as np
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
+from numpy.typing import NDArray
+from zstandard import ZstdError, get_frame_parameters
 
+from logs.recording.budget import MAX_CHUNK_BYTES
 from uavctl.errors import RecordingError
 
 TOPIC = "/uavctl/sender"
@@ -81,3 +92,76 @@ class SenderRecording:
             self._writer.add_message(self._channel, time_ns, json.dumps(message).encode(), time_ns)
         except OSError as error:
             self.failure = error.strerror or "write error"
+
+
+class _SentPosition(msgspec.Struct, frozen=True):
+    """A message of the recording, without what the reader does not use."""
+
+    vehicle: str
+    ages_s: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SentPositions:
+    """Order in which a sender served its vehicles."""
+
+    names: tuple[str, ...]  # of all its vehicles, also of those that it never served
+    at_ns: NDArray[np.int64]  # (n,) UTC, ascending
+    vehicles: NDArray[np.int64]  # (n,) index of the vehicle
+    fault: str = ""  # why the recording is not whole; what came before is good
+
+    def get_times_ns(self, name: str) -> NDArray[np.int64]:
+        """Return the times of the messages to a vehicle."""
+        return np.asarray(self.at_ns[self.vehicles == self.names.index(name)], dtype=np.int64)
+
+
+_DECODER = msgspec.json.Decoder(_SentPosition)
+_ERRORS = (McapError, ZstdError, msgspec.MsgspecError, ValueError, OverflowError)
+
+
+def read_sender(path: Path) -> SentPositions:
+    """Read the recording of a sender up to its end, or to its first damage.
+
+    Raises:
+        RecordingError: It cannot be read, or holds no position before the damage.
+    """
+    times_ns: list[int] = []
+    vehicles: list[int] = []
+    numbers: dict[str, int] = {}
+    fault = ""
+    try:
+        with path.open("rb") as file:
+            for at_ns, position in _iterate_positions(file):
+                for name in (*position.ages_s, position.vehicle):
+                    numbers.setdefault(name, len(numbers))
+                times_ns.append(at_ns)
+                vehicles.append(numbers[position.vehicle])
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+    except (EndOfFile, struct.error):
+        fault = f"{path}: the recording is torn, or still written"
+    except _ERRORS as error:
+        fault = f"{path}: the recording is damaged ({error or type(error).__name__})"
+    if not times_ns:
+        raise RecordingError(fault or f"{path}: the sender sent nothing")
+    order = np.argsort(np.array(times_ns, dtype=np.int64), kind="stable")
+    return SentPositions(
+        tuple(numbers), np.array(times_ns, dtype=np.int64)[order], np.array(vehicles, dtype=np.int64)[order], fault
+    )
+
+
+def _iterate_positions(file: BinaryIO) -> Iterator[tuple[int, _SentPosition]]:
+    """Yield the UTC [ns] and content of each message on the topic."""
+    channels: set[int] = set()
+    for record in StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK_BYTES).records:
+        if not isinstance(record, Chunk):
+            continue
+        if record.compression and get_frame_parameters(record.data).content_size != record.uncompressed_size:
+            raise ValueError("a chunk unpacks to another size than it claims")
+        if record.uncompressed_size > MAX_CHUNK_BYTES:
+            raise ValueError("a chunk is too large")
+        for item in breakup_chunk(record, validate_crc=True):
+            if isinstance(item, Channel) and item.topic == TOPIC:
+                channels.add(item.id)
+            elif isinstance(item, Message) and item.channel_id in channels:
+                yield item.log_time, _DECODER.decode(item.data)

@@ -41,7 +41,7 @@ from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.load import read_document
 from uavctl.daemon.control_socket import ControlRequest, find_control_folder, make_daemon_name
 from uavctl.daemon.health import Health
-from uavctl.errors import ConfigError, NotReachedError
+from uavctl.errors import ConfigError, NotReachedError, UavctlError
 from uavctl.flight.limits import AXES
 from uavctl.wiring.radio import (
     RadioConfig,
@@ -265,11 +265,13 @@ def fly(
             time.sleep(POLL_S)
         for flight in flights:
             flight.join_output()
+    page = _draw_page(out)
     document = {
         "vehicles": [
             {"name": flight.member.name, "exit_code": flight.exit_code, "out": str(out / flight.member.name)}
             for flight in flights
-        ]
+        ],
+        "report": None if page is None else str(page),
     }
     Common(json=json).show("fleet/fly", document, lambda: _make_exit_table(flights))
     return max((flight.exit_code or 0 for flight in flights), default=0)
@@ -299,6 +301,22 @@ def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)
         all_accepted = all_accepted and verdict == "accepted"
         print_message(f"{member.name}: land {verdict}: {text}", highlight=False)
     return 0 if all_accepted else 1
+
+
+def _draw_page(folder: Path) -> Path | None:
+    """Draw the page of all recordings, and print its first line; a failure is only printed."""
+    from logs.report.fleet import PAGE
+    from uavctl.cli.flying import print_warning, run_page_process
+
+    page = folder / PAGE
+    try:
+        with stop_on_signals():  # the flights are over: a first signal ends nothing any more
+            line = run_page_process("logs.report.fleet_page", folder, page)
+    except UavctlError as error:
+        print_warning(f"no page: {error}")
+        return None
+    print_message(f"{line}\npage: {page}".strip(), highlight=False)
+    return page
 
 
 class FleetFlight:

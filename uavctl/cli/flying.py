@@ -190,9 +190,24 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
     Raises:
         UavctlError: The page cannot be written; the recording is unchanged.
     """
-    command = [sys.executable, "-P", "-m", "logs.report.flight_page", str(path), str(page)]
+    run_page_process("logs.report.flight_page", path, page, pickle.dumps(summary))
+
+
+def run_page_process(module: str, path: Path, page: Path, data: bytes = b"") -> str:
+    """Run a module that draws a page in a process of its own; return its output.
+
+    Args:
+        module: Called with both paths.
+        path: Path of the recording, or of a fleet's folder.
+        page: Path of the page.
+        data: Standard input of the process.
+
+    Raises:
+        UavctlError: The page cannot be written; the recordings are unchanged.
+    """
+    command = [sys.executable, "-P", "-m", module, str(path), str(page)]
     try:
-        process = subprocess.run(command, input=pickle.dumps(summary), capture_output=True, check=False)
+        process = subprocess.run(command, input=data, capture_output=True, check=False)
     except OSError as error:  # no memory, or no descriptor left
         raise UavctlError(f"{page}: {error.strerror}; `uavctl log report {path}` draws the page later") from error
     if process.returncode:
@@ -200,6 +215,7 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
         reason = error_lines[-1] if error_lines else f"its process ended with {process.returncode}"
         prefix = "" if str(page) in reason else f"{page}: "
         raise UavctlError(f"{prefix}{reason}; `uavctl log report {path}` draws the page once that is mended")
+    return process.stdout.decode(errors="replace").strip()
 
 
 @contextmanager

@@ -204,7 +204,10 @@ _COMMANDS = {
         changed: the output shows the first decision that differs on the same inputs.
         """,
     ),
-    "report": ("log_report:report", "Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file."),
+    "report": (
+        "log_report:report",
+        "Write the page of a recording, fleet's folder, .tlog, or ULog of PX4: one HTML file.",
+    ),
     "compare": (
         "log_report:compare_command",
         "Compare flights: parameters that differ, figures, and the first difference.",

@@ -1,6 +1,6 @@
 """Commands `uavctl log report` and `uavctl log compare`, which draw pages.
 
-A report is of our recording, a `.tlog` of any ground station, or a ULog of PX4.
+A report is of our recording, of a fleet's folder, a `.tlog` of any ground station, or a ULog of PX4.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from logs.report.compare_text import (
 from logs.report.evidence import FlightEvidence
 from logs.report.figures import draw_overview
 from logs.report.findings import Headline
+from logs.report.fleet import PAGE, is_fleet_folder, read_fleet
+from logs.report.fleet_page import derive_banner, write_fleet_page
 from logs.report.flight_page import write_report
 from logs.report.headline import derive_headline
 from logs.report.tlog_headline import derive_tlog_headline
@@ -123,10 +125,12 @@ def report(
     rehearsals: Rehearsals = None,
     json: Json = False,
 ) -> int:
-    """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else.
+    """Write the page of a recording, fleet's folder, .tlog, or ULog of PX4: one HTML file that needs nothing else.
 
     The page has the probability that such a flight leaves the room, by rehearsals, beside the observed share.
     """
+    if is_fleet_folder(flight):
+        return _report_fleet(flight, out, svg, Common(json=json))
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         refuse_recording_path(target)
@@ -149,6 +153,20 @@ def report(
         document,
         lambda: _render_report(headline, make_summary_table(summary, make_verdict_rows(verdicts.verdicts))),
     )
+    return 0
+
+
+def _report_fleet(folder: Path, out: Path | None, svg: Path | None, common: Common) -> int:
+    """Write the page of a fleet's folder."""
+    if svg is not None:
+        raise UsageError(f"--svg draws one flight; {folder} is the folder of a fleet, and of it there is the page")
+    page = out if out is not None else folder / PAGE
+    refuse_recording_path(page)
+    fleet = read_fleet(folder)
+    figures = write_fleet_page(fleet, page)
+    for note in figures.notes:
+        warn(note)
+    common.show("log/report-fleet", figures, lambda: Group(make_headline_text(derive_banner(fleet)), f"page: {page}"))
     return 0
 
 

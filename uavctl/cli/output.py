@@ -21,7 +21,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     import msgspec
 
-    from logs.report.findings import Headline
+    from logs.report.findings import Banner
 
 _DOCUMENT_STREAM: ContextVar[TextIO | None] = ContextVar("documents", default=None)
 
@@ -122,7 +122,7 @@ def warn(text: str) -> None:
 _STYLES = {"good": "bold green", "mind": "bold yellow", "bad": "bold red"}
 
 
-def make_headline_text(headline: Headline) -> Text:
+def make_headline_text(headline: Banner) -> Text:
     """Return the first line of a recording's page, in its colour."""
     return Text.assemble((f"{headline.word}: ", _STYLES[headline.tone]), headline.text)
 
