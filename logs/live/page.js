@@ -1,10 +1,11 @@
 "use strict";
 // Draws what comes from /scenes. Paths are collected here, from the moment on at which the page was opened.
-const PATH = 300, MINUTE_S = 60;
+const PATH = 300, MINUTE_S = 60, COLOURS = 7;
 const byId = (id) => document.getElementById(id);
 const paths = new Map(), ages = [];
 let scene = null, heard = 0;
 
+const colourOf = (number) => colour("v" + (number % COLOURS));
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
 
 function canvasOf(id) {
@@ -32,11 +33,16 @@ function drawView(id, up) {
   };
   const box = corners(scene.box), margins = corners(scene.margins);
   for (const body of scene.bodies) seen.push(flat(body.at_m));
+  for (const one of scene.vehicles) {
+    for (const at of [one.at_m, one.target_m, ...one.plan]) if (at) seen.push(flat(at));
+  }
+  const vehicleBoxes = scene.vehicles.map((one) => one.boxes.map(corners));
   for (const path of paths.values()) for (const at of path) seen.push(flat(at));
   if (scene.target_m) seen.push(flat(scene.target_m));
-  if (box) {
-    for (const x of [box.left, box.right]) if (x !== null) seen.push([x, seen.length ? seen[0][1] : 0]);
-    for (const y of [box.bottom, box.top]) if (y !== null) seen.push([seen.length ? seen[0][0] : 0, y]);
+  for (const sides of [box, ...vehicleBoxes.flat()]) {
+    if (!sides) continue;
+    for (const x of [sides.left, sides.right]) if (x !== null) seen.push([x, seen.length ? seen[0][1] : 0]);
+    for (const y of [sides.bottom, sides.top]) if (y !== null) seen.push([seen.length ? seen[0][0] : 0, y]);
   }
   if (!seen.length) return;
   const xs = seen.map((at) => at[0]), ys = seen.map((at) => at[1]);
@@ -58,22 +64,37 @@ function drawView(id, up) {
   };
   if (box) frame(box, colour("muted"));
   if (margins) frame(margins, colour("margin"), [5, 4]);
-  for (const [name, path] of paths) line(path.map(flat), name === "truth" ? colour("plain") : colour("good"), 1.5);
+  const numbers = new Map(scene.vehicles.map((one, number) => [one.name, number]));
+  const inkOf = (name) => numbers.has(name) ? colourOf(numbers.get(name)) : colour(name === "truth" ? "plain" : "good");
+  for (const [name, path] of paths) line(path.map(flat), inkOf(name), 1.5);
   if (scene.plan.length) line(scene.plan.map(flat), colour("plan"), 2.5);
-  pen.fillStyle = colour("ink");
-  if (scene.target_m) {
-    const [x, y] = flat(scene.target_m);
-    line([[x - 8 / scale, y], [x + 8 / scale, y]], colour("ink"), 1.5);
-    line([[x, y - 8 / scale], [x, y + 8 / scale]], colour("ink"), 1.5);
-  }
-  for (const body of scene.bodies) {
-    const [x, y] = flat(body.at_m);
-    pen.fillStyle = colour(body.level);
+  const cross = (at, ink) => {
+    const [x, y] = flat(at);
+    line([[x - 8 / scale, y], [x + 8 / scale, y]], ink, 1.5);
+    line([[x, y - 8 / scale], [x, y + 8 / scale]], ink, 1.5);
+  };
+  const dot = (name, at, ink, below) => {
+    const [x, y] = flat(at);
+    pen.fillStyle = ink;
     pen.beginPath(); pen.arc(px(x), py(y), 5, 0, 7); pen.fill();
-    const room = px(x) + 8 + pen.measureText(body.name).width < width;
+    const room = px(x) + 8 + pen.measureText(name).width < width;
     pen.textAlign = room ? "left" : "right";
-    pen.fillText(body.name, px(x) + (room ? 8 : -8), py(y) + (body.name === "truth" ? 14 : -6));
-  }
+    pen.fillText(name, px(x) + (room ? 8 : -8), py(y) + (below ? 14 : -6));
+  };
+  if (scene.target_m) cross(scene.target_m, colour("ink"));
+  for (const body of scene.bodies) dot(body.name, body.at_m, colour(body.level), body.name === "truth");
+  scene.vehicles.forEach((one, number) => {
+    const ink = colourOf(number);
+    for (const sides of vehicleBoxes[number]) frame(sides, ink, [2, 3]);
+    if (one.plan.length) line(one.plan.map(flat), ink, 3);
+    if (one.target_m) cross(one.target_m, ink);
+    if (!one.at_m) return;
+    dot(one.name, one.at_m, ink);
+    if (one.level === "good" || one.level === "plain") return;
+    const [x, y] = flat(one.at_m);
+    pen.strokeStyle = colour(one.level); pen.lineWidth = 3;
+    pen.beginPath(); pen.arc(px(x), py(y), 10, 0, 7); pen.stroke();
+  });
   pen.textAlign = "left";
   pen.fillStyle = colour("muted");
   const rod = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50].find((metres) => metres * scale > 40) || 100;
@@ -103,15 +124,27 @@ function drawAges() {
   pen.stroke();
 }
 
-function row(cells, level) {
+function row(cells, level, kind) {
   const tr = document.createElement("tr");
   cells.forEach((text, i) => {
-    const cell = document.createElement(i ? "td" : "th");
+    const cell = document.createElement(kind || (i ? "td" : "th"));
     cell.textContent = text;
     if (i) cell.className = level;
     tr.append(cell);
   });
   return tr;
+}
+
+function drawTable() {
+  byId("fleet").hidden = !scene.vehicles.length;
+  byId("now").hidden = !!scene.vehicles.length;
+  byId("messages").className = scene.vehicles.length ? "wide" : "";
+  byId("columns").replaceChildren(row(scene.columns, "", "th"));
+  byId("vehicles").replaceChildren(...scene.vehicles.map((one, number) => {
+    const tr = row(one.cells, one.level);
+    tr.firstChild.style.color = colourOf(number);
+    return tr;
+  }));
 }
 
 function draw() {
@@ -122,6 +155,7 @@ function draw() {
   drawView("above", 0);
   drawView("side", 2);
   drawAges();
+  drawTable();
   byId("figures").replaceChildren(...scene.figures.map((one) => row([one.name, one.value], one.level)));
   byId("events").replaceChildren(...scene.events.map((one) => {
     const item = document.createElement("li");
@@ -138,7 +172,7 @@ source.onmessage = (message) => {
   if (!next) return;
   if (scene && next.time_s < scene.time_s) { paths.clear(); ages.length = 0; }
   scene = next;
-  for (const body of scene.bodies) {
+  for (const body of [...scene.bodies, ...scene.vehicles.filter((one) => one.at_m)]) {
     const path = paths.get(body.name) || [];
     path.push(body.at_m);
     if (path.length > PATH) path.shift();

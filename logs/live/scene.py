@@ -68,6 +68,18 @@ class SceneEvent(msgspec.Struct, frozen=True):
     text: str
 
 
+class SceneVehicle(msgspec.Struct, frozen=True):
+    """One of several vehicles on a page: its row in the table, and its place on the map."""
+
+    name: str
+    cells: tuple[str, ...]  # under `LiveScene.columns`
+    level: Level = "good"
+    at_m: Vec3 | None = None  # local NED, as is all below
+    plan: tuple[Vec3, ...] = ()
+    target_m: Vec3 | None = None
+    boxes: tuple[SceneBox, ...] = ()  # that it stays within
+
+
 class LiveScene(msgspec.Struct, frozen=True):
     """All that a page shows at a moment."""
 
@@ -84,6 +96,8 @@ class LiveScene(msgspec.Struct, frozen=True):
     age_limit_s: float | None = None
     figures: tuple[SceneFigure, ...] = ()
     events: tuple[SceneEvent, ...] = ()
+    columns: tuple[str, ...] = ()
+    vehicles: tuple[SceneVehicle, ...] = ()  # of a fleet
 
 
 class FlightScene:

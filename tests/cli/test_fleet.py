@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
@@ -23,10 +24,13 @@ from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, end_process, reserve_
 from patience import wait_until
 from places import ROOT, without_pages
 
+from logs.live.client import SceneReader
+from logs.report.fleet import read_fleet as read_flown_fleet
 from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
 from uavctl.cli.ctl import send_request
 from uavctl.cli.fleet import FleetFlight, Member, compute_gap_m, read_fleet
+from uavctl.cli.fleet_view import choose_ports
 from uavctl.config import load_config
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
 from uavctl.errors import ConfigError, NotReachedError
@@ -209,7 +213,9 @@ def test_positions_in_two_boxes_are_as_far_apart_as_the_reported_gap(
 
 
 @contextmanager
-def fly_fleet() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[str]]]:
+def fly_fleet(
+    *options: str, environ: Mapping[str, str] | None = None
+) -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[str]]]:
     """Two simulated vehicles in the air, flown by `uavctl fleet fly`; with their true places."""
     truths: dict[str, list[Truth]] = {"west": [], "east": []}
     done, seats, tables = threading.Event(), [], []
@@ -231,9 +237,13 @@ def fly_fleet() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen
         path.write_text(HEAD + "".join(tables))
         command = [sys.executable, "-m", "uavctl", "fleet", "fly", str(path), "--out", str(Path(folder) / "out")]
         try:
-            environ = without_pages() | {FOLDER_VARIABLE: str(Path(folder) / "c")}
+            own_environ = {**(environ or without_pages()), FOLDER_VARIABLE: str(Path(folder) / "c")}
             fleet = subprocess.Popen(
-                [*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environ
+                [*command, "--json", *options],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                env=own_environ,
             )
             with end_process(fleet):
                 # Nobody would fly them while the daemons begin.
@@ -295,6 +305,33 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
     flown = [(west.position_m, east.position_m) for west, east in places if west.mode == east.mode == "OFFBOARD"]
     assert len(flown) > 5
     assert min(max(abs(a - b) for a, b in zip(west[:2], east[:2], strict=True)) for west, east in flown) >= SPACING_M
+
+
+@pytest.mark.slow
+def test_both_are_on_the_live_page_where_they_are_and_on_the_page_of_the_end() -> None:
+    (port,) = choose_ports(1)
+    with fly_fleet("--live", "--live-port", str(port), environ=os.environ) as (path, truths, fleet):
+        reader = SceneReader(port)
+
+        def are_shown() -> bool:
+            vehicles = [] if reader.scene is None else reader.scene.vehicles
+            errors_m = [
+                math.dist(one.at_m, truths[one.name][-1].position_m) for one in vehicles if one.at_m and one.plan
+            ]
+            return len(errors_m) == 2 and max(errors_m) < 0.3
+
+        try:
+            wait_until(are_shown, "both are shown with their plans")
+        finally:
+            reader.close()
+        fleet.send_signal(signal.SIGINT)
+        document = json.loads(fleet.communicate()[0])
+        page, flown = Path(document["report"]), read_flown_fleet(path.parent / "out")
+        assert page.is_file() and [vehicle.name for vehicle in flown.vehicles] == ["east", "west"]
+    places = [(west.position_m, east.position_m) for west, east in zip(truths["west"], truths["east"], strict=False)]
+    true_m = min(math.dist(*pair) for pair in places)
+    (approach,) = flown.approaches
+    assert approach.distance_m == pytest.approx(true_m, abs=0.2) and not approach.is_true
 
 
 def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(

@@ -17,7 +17,8 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import combinations
+from functools import partial
+from itertools import combinations, zip_longest
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +32,8 @@ from uavctl.arrays import SECOND_NS
 from uavctl.cli import main
 from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, make_key_overrides
 from uavctl.cli.ctl import send_request
+from uavctl.cli.fleet_view import ShownVehicle, choose_ports, show_fleet_page
+from uavctl.cli.flying import LivePort, check_take_off, choose_live_port, print_warning, run_page_process
 from uavctl.cli.health_lines import hide_health_lines
 from uavctl.cli.output import make_message_console, make_table, print_message
 from uavctl.cli.signals import stop_on_signals
@@ -64,6 +67,9 @@ fleet_app = App(
     help_epilogue=format_example("fleet"),
     help_format="markdown",
 )
+FleetLive = Annotated[
+    bool, Parameter(negative=(), help="show all vehicles on one page to browsers on this machine, and each on its own")
+]
 File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] table for each vehicle")]
 
 
@@ -238,20 +244,29 @@ def fly(
     arm: Annotated[bool, Parameter(negative=(), help="the vehicles may be armed; needs --takeoff")] = False,
     takeoff: TakeOff = None,
     out: Annotated[Path, Parameter(help="folder of the recordings, one below it for each vehicle")],
+    live: FleetLive = False,
+    live_port: LivePort = None,
     json: QuietJson = False,
 ) -> int:
     """Fly all vehicles of a file, each by a daemon of its own; Ctrl-C lands them all, or hands them over.
 
     When one ends otherwise than it was asked to, the others are landed, too. Exit code: the largest of theirs.
     """
-    from uavctl.cli.flying import check_take_off
-
     check_take_off(arm, takeoff)
+    view_port = choose_live_port(live=live, port=live_port)
     fleet = read_fleet(file)
     options = [*(("--duration", str(duration)) if duration is not None else ())]
     options += ["--arm", "--takeoff", str(takeoff)] if takeoff is not None else []
-    flights = [FleetFlight(member, [*options, "--out", str(out / member.name)]) for member in fleet.members]
-    with stop_on_signals() as stopped, _show_status(flights) as health:
+    ports = [] if view_port is None else choose_ports(len(fleet.members))
+    flights = [
+        FleetFlight(member, [*options, "--out", str(out / member.name), *_make_live_options(port)])
+        for member, port in zip_longest(fleet.members, ports)
+    ]
+    with (
+        stop_on_signals() as stopped,
+        _show_status(flights) as health,
+        _open_page(f"uavctl fleet: {file.stem}", view_port, flights, ports, health),
+    ):
         for flight in flights:
             flight.start()
         is_landing = False
@@ -303,12 +318,42 @@ def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)
     return 0 if all_accepted else 1
 
 
+def _make_live_options(port: int | None) -> tuple[str, ...]:
+    return () if port is None else ("--live", "--live-port", str(port))
+
+
+@contextmanager
+def _open_page(
+    title: str,
+    live_port: int | None,
+    flights: Sequence[FleetFlight],
+    ports: Sequence[int],
+    health_by_name: HealthByName,
+) -> Iterator[None]:
+    """Serve the live page of all vehicles; without a port there is none."""
+    if live_port is None:
+        yield
+        return
+    vehicles = [
+        ShownVehicle(
+            flight.member.name,
+            port,
+            partial(health_by_name.get, flight.member.name),
+            partial(getattr, flight, "exit_code"),
+        )
+        for flight, port in zip(flights, ports, strict=True)
+    ]
+    with show_fleet_page(title, live_port, vehicles):
+        yield
+
+
 def _draw_page(folder: Path) -> Path | None:
     """Draw the page of all recordings, and print its first line; a failure is only printed."""
-    from logs.report.fleet import PAGE
-    from uavctl.cli.flying import print_warning, run_page_process
+    from logs.report.fleet import PAGE, is_fleet_folder
 
     page = folder / PAGE
+    if not is_fleet_folder(folder):  # no daemon came so far
+        return None
     try:
         with stop_on_signals():  # the flights are over: a first signal ends nothing any more
             line = run_page_process("logs.report.fleet_page", folder, page)
