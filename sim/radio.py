@@ -26,10 +26,10 @@ class SentMessage(Protocol):
 class Sender(Protocol):
     """Interface of a sender of the positions of several vehicles over one channel with a budget."""
 
-    def receive_positions(self, number: int, data: bytes, at_ns: int) -> None:
+    def receive_positions(self, source: int, data: bytes, at_ns: int, /) -> object:
         """Take data of the cameras of a vehicle."""
 
-    def receive_reports(self, number: int, data: bytes, at_ns: int) -> None:
+    def receive_reports(self, number: int, data: bytes, at_ns: int, /) -> None:
         """Take data of what flies a vehicle: reports of its newest position."""
 
     def compute_remaining_ns(self, at_ns: int) -> int:

@@ -16,6 +16,7 @@ from uavctl.cli.app import run
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError
+from uavctl.io.shared_sources import find_shared_sources
 from uavctl.lab.lockstep import FlownFleet, fly_fleet
 from uavctl.mavlink.connection import MOCAP, make_links
 from uavctl.records import Decision, Outgoing, PositionSample, Received, Send, Truth
@@ -23,7 +24,7 @@ from uavctl.schedule.ages import compute_periodic_tail
 from uavctl.schedule.scheduler import ScheduleName
 from uavctl.wiring.controller import build_flight_design, prepare
 from uavctl.wiring.radio import RadioConfig, compute_slot_ns, make_link_overrides
-from uavctl.wiring.sender import PositionSender, SentPosition
+from uavctl.wiring.sender import PositionSender, SentAnswer, SentPosition
 
 FRAME_BYTES = 44
 LOSSES = (0.3, 0.0, 0.0)
@@ -143,12 +144,13 @@ class WatchedSender(PositionSender):
     """Sender that keeps its messages."""
 
     def __init__(self, configs: Sequence[Config], radio: RadioConfig) -> None:
-        super().__init__(configs, [config.daemon.mocap for config in configs], radio, spacing_m=0.0, start_ns=0)
+        sources = find_shared_sources([f"udpin://0.0.0.0:{14600 + number}" for number in range(len(configs))])
+        super().__init__(configs, sources, radio, spacing_m=0.0, start_ns=0, keeps_stamps=True)
         self.messages: list[tuple[int, SentPosition]] = []
 
-    def send_next(self, at_ns: int) -> SentPosition | None:
+    def send_next(self, at_ns: int) -> SentPosition | SentAnswer | None:
         sent = super().send_next(at_ns)
-        if sent is not None:
+        if isinstance(sent, SentPosition):
             self.messages.append((at_ns, sent))
         return sent
 

@@ -19,13 +19,14 @@ from uavctl.cause import Cause
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError, RecordingError, UsageError
+from uavctl.io.shared_sources import find_shared_sources
 from uavctl.loop import ControlLoop
 from uavctl.records import ClosestApproach, Collision, FleetTruth, Received, Send, Ticked, Truth, VehicleTruth
 from uavctl.wiring.controller import Prepared
 from uavctl.wiring.radio import RadioConfig, find_radio_problems
-from uavctl.wiring.sender import PositionSender, SentPosition
+from uavctl.wiring.sender import PositionSender, SentAnswer, SentPosition
 
-_DATAGRAMS = "udpin://"  # kind of the cameras' URL: each datagram is whole
+_DATAGRAMS = "udpin://0.0.0.0:{}"  # URL of the cameras of a vehicle: each datagram is whole
 TRUTH = "/sim/truth"
 FLEET_TRUTH = "/sim/fleet"
 COLLISION = "/sim/collision"
@@ -148,18 +149,19 @@ class RecordedSender:
         if not radio.has_budget:
             raise ConfigError(("radio: has no budget; give bytes_per_s or messages_per_s",))
         configs = [one.config for one in prepared]
-        sender = PositionSender(configs, [_DATAGRAMS] * len(configs), radio, spacing_m=spacing_m, start_ns=0)
+        sources = find_shared_sources([_DATAGRAMS.format(number) for number in range(len(configs))])
+        sender = PositionSender(configs, sources, radio, spacing_m=spacing_m, start_ns=0, keeps_stamps=True)
         self._sender = sender
         self.receive_positions, self.receive_reports = sender.receive_positions, sender.receive_reports
         self.compute_remaining_ns = sender.compute_remaining_ns
         names = [f"vehicle-{config.sim.system_id}" for config in configs]
         self._recording = SenderRecording(path, names, VIRTUAL_ZERO_UTC_NS)
 
-    def send_next(self, at_ns: int) -> SentPosition | None:
-        """Return and record the position that goes out now; see `PositionSender`."""
+    def send_next(self, at_ns: int) -> SentPosition | SentAnswer | None:
+        """Return the message that goes out now, and record a position; see `PositionSender`."""
         sent = self._sender.send_next(at_ns)
-        if sent is not None:
-            self._recording.add(at_ns, sent.vehicle, sent.captured_ns, len(sent.frame), sent.ages_s)
+        if isinstance(sent, SentPosition):
+            self._recording.add(at_ns, sent.vehicle, sent.captured_ns, sent.wire_bytes, sent.ages_s)
         return sent
 
     def close(self) -> None:

@@ -129,6 +129,7 @@ class _Target:
         self.position_m: Vec3 | None = None  # newest one, local NED
         self.received_ns = start_ns  # of the newest one
         self.next_frame: tuple[Vec3, Vec3] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))  # position, angles
+        self.source_stamp_us = 0  # stamp of the newest one, in its source's clock
         self.captured_ns_by_stamp: dict[int, int] = {}  # of positions sent
         self.request: tuple[int, int] | None = None  # newest time request: its own time, and its arrival [ns]
         self.answered_ns = start_ns
@@ -152,6 +153,7 @@ class PositionSender:
         sources: Connections that give their positions.
         spacing_m: Smallest distance of two vehicles [m].
         start_ns: Time of the start [ns].
+        keeps_stamps: Whether positions keep the stamps of their source, whom the vehicles then ask for its time.
 
     Raises:
         DesignError: A plant is not valid, or the longest wait has no slot for each vehicle.
@@ -165,7 +167,9 @@ class PositionSender:
         *,
         spacing_m: float,
         start_ns: int,
+        keeps_stamps: bool = False,
     ) -> None:
+        self._keeps_stamps = keeps_stamps
         self.refused: Counter[str] = Counter()
         self.sent = Counter[int]()
         self._sources = [_Source(source) for source in sources]
@@ -227,6 +231,7 @@ class PositionSender:
             rotation = None if attitude is None else target.frame.attitude_from_ned(attitude, euler=True)
             angles = (0.0, 0.0, 0.0) if rotation is None else euler_from_quaternion(rotation)
             target.position_m, target.received_ns = sample.position_m, at_ns
+            target.source_stamp_us = message.stamp_us or 0
             target.next_frame = target.frame.from_ned(sample.position_m), angles
         return target.decoder.is_settled
 
@@ -238,7 +243,7 @@ class PositionSender:
         """Handle data of a vehicle's daemon: reports of its newest position, time requests; never raises."""
         target = self._targets[number]
         for frame in scan_frames(data, final=True).frames:
-            if frame.message_id == mavlink.MAVLINK_MSG_ID_TIMESYNC:
+            if frame.message_id == mavlink.MAVLINK_MSG_ID_TIMESYNC and not self._keeps_stamps:
                 request = _TIMESYNC.unpack(frame.data)
                 if request.tc1 == 0 and request.ts1 > 0:
                     target.request = request.ts1, at_ns
@@ -268,7 +273,8 @@ class PositionSender:
             return None
         target, captured_ns = self._targets[number], self._scheduler.vehicles[number].sent_ns
         assert captured_ns is not None
-        stamp_us = max(captured_ns // 1000, 1)  # 0 means that there is none
+        # 0 means that there is none
+        stamp_us = target.source_stamp_us if self._keeps_stamps else max(captured_ns // 1000, 1)
         frame = target.encoder.encode_position(stamp_us, *target.next_frame)
         if len(target.captured_ns_by_stamp) >= MAX_OPEN_STAMPS:
             del target.captured_ns_by_stamp[next(iter(target.captured_ns_by_stamp))]
