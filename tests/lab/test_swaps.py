@@ -77,6 +77,22 @@ def test_a_pair_is_too_close_at_most_as_often_as_one_of_both_is_outside(tmp_path
     assert swap.positions_m[1, 0] < 0.25 + 0.4
 
 
+def test_one_axis_leads_in_the_first_motion(tmp_path: Path) -> None:
+    begins_m = np.array([[-2.0, -2.0, -1.2], [2.0, 2.4, -1.2]])
+    swap = Swap(SwapCase(2, seed=4, limit_s=3.0), begins_m, np.array([[1.0, 1.0, -1.2], [2.0, 2.4, -1.2]]), tmp_path)
+    moved_m = np.zeros(2)  # of the leading axis, and of the other one until then
+
+    def watch(_: float) -> bool:
+        north_m, east_m = np.abs(swap.positions_m[0] - begins_m[0])[:2] if swap.fleet.truths else (0.0, 0.0)
+        if max(north_m, east_m) < 0.2:
+            moved_m[:] = max(north_m, east_m), min(north_m, east_m)
+        return True
+
+    swap.fly(watch)
+    assert moved_m[0] > 0.1
+    assert moved_m[1] < 0.05
+
+
 @pytest.mark.slow
 def test_vehicles_hold_in_their_last_boxes_when_the_coordinator_stops(tmp_path: Path) -> None:
     swap = make_swap(SwapCase(3, seed=11, cells_end_s=2.0, limit_s=12.0), tmp_path)

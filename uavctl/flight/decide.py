@@ -314,7 +314,8 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
     if draft.fallback is not None and draft.fallback.mode is ControlMode.HOLD:
         draft = replace(draft, left_hold_ns=context.boundary_ns)
-    mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
+    if controller.cell_rows is None or draft.cells.choice.cell is not None:  # without a cell, it stays
+        mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
     target, preview = make_question(controller.mission, mission, context.boundary_ns)
     is_first = is_led(controller.mission, mission, context.boundary_ns)
     preview = set_risk(preview, phase.state.risk, controller.risk, is_led=is_first)
@@ -322,7 +323,7 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     if controller.cell_rows is None:
         asked = _ask(base, target, preview, phase)
     else:
-        draft, asked = _plan_in_cell(draft, base, preview, phase)
+        draft, asked = _plan_in_cell(draft, base, target if is_first else None, preview, phase)
     draft = replace(draft, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
     if asked.plan is None:
         reason = "no new plan: the old one plays out"
@@ -359,17 +360,23 @@ def _locate(plan: Plan, phase: _Phase) -> PlannedPath:
     return locate_plan(plan, rows, phase.context.boundary_ns, controller.dt_ns, position_m)
 
 
-def _plan_in_cell(draft: Decided, base: Estimate, preview: Preview, phase: _Phase) -> tuple[Decided, SolveOutcome]:
-    """Plan inside of the cell that waits, and take it if the plan keeps it; else inside of the one in use."""
+def _plan_in_cell(
+    draft: Decided, base: Estimate, target: Array | None, preview: Preview, phase: _Phase
+) -> tuple[Decided, SolveOutcome]:
+    """Plan inside of the cell that waits, and take it if the plan keeps it; else inside of the one in use.
+
+    Args:
+        target: Equilibrium to go to (n_x,); None: the goal of the cell.
+    """
     pending = draft.cells.pending
     if pending is not None:
-        asked = _ask_in_cell(pending, base, preview, phase)
+        asked = _ask_in_cell(pending, base, target, preview, phase)
         cells = draft.cells if asked.plan is None else choose_cell(draft.cells, _locate(asked.plan, phase))
         if cells is not draft.cells:
             return replace(draft, cells=cells), asked
         draft = replace(draft, cells=refuse_cell(draft.cells))
     if draft.cells.choice.cell is not None:
-        return draft, _ask_in_cell(draft.cells.choice.cell, base, preview, phase)
+        return draft, _ask_in_cell(draft.cells.choice.cell, base, target, preview, phase)
     region, rest = phase.controller.mission.rest_region, draft.cells.rest
     if rest is None:
         rest = base.mean if region is None else region.find_stop(base.mean)
@@ -377,12 +384,15 @@ def _plan_in_cell(draft: Decided, base: Estimate, preview: Preview, phase: _Phas
     return replace(draft, cells=replace(draft.cells, rest=rest)), _ask(base, np.array(rest), preview, phase)
 
 
-def _ask_in_cell(cell: MovingCell, base: Estimate, preview: Preview, phase: _Phase) -> SolveOutcome:
-    """Ask the solver for a plan inside of a cell, to its goal."""
+def _ask_in_cell(
+    cell: MovingCell, base: Estimate, target: Array | None, preview: Preview, phase: _Phase
+) -> SolveOutcome:
+    """Ask the solver for a plan inside of a cell, to its goal or to another target."""
     controller, rows = phase.controller, phase.controller.cell_rows
     assert rows is not None
-    north, east, down = cell.goal_m.tolist()
-    target = controller.plant.equilibrium((north, east, down))
+    if target is None:
+        north, east, down = cell.goal_m.tolist()
+        target = controller.plant.equilibrium((north, east, down))
     limits, horizon = controller.mission.limits, controller.horizon
     bounded = limit_preview(preview, cell, rows, limits, base.at_ns, controller.dt_ns, horizon)
     return _ask(base, target, bounded, phase)
