@@ -23,7 +23,7 @@ from uavctl.cell_report import find_conduct, make_report
 from uavctl.config import Config
 from uavctl.errors import TickOverdueError, in_words
 from uavctl.event_codes import EventCode
-from uavctl.fleet.cell import CellChoice, parse_cell
+from uavctl.fleet.cell import NO_CELL, CellChoice, parse_cell
 from uavctl.flight.controller import Controller
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
@@ -40,6 +40,7 @@ from uavctl.records import (
     CellMessage,
     CellReport,
     Command,
+    Conduct,
     ControlMode,
     Datagram,
     Decision,
@@ -486,11 +487,22 @@ class ControlLoop:
         """Report to the coordinator of the cells how the vehicle moves; None before its position is known."""
         if self._decision is None or self._estimate is None or self._controller.cell_rows is None:
             return None
-        conduct = find_conduct(self.handover_state, self._vehicle, self._state)
+        conduct = self._find_conduct()
         height_m = self._hand_over.height_m if self._hand_over.is_ordered_flight else 0.0
         return make_report(
             self._state, self._controller, self._estimate, self._decision, self.handover_state, conduct, height_m
         )
+
+    @property
+    def cell_status(self) -> tuple[int, Conduct] | None:
+        """Number of the moving cell in use (0 without one), and the vehicle's conduct; None in a flight without any."""
+        if self._controller.cell_rows is None:
+            return None
+        cell = self._state.cells.choice.cell
+        return NO_CELL if cell is None else cell.number, self._find_conduct()
+
+    def _find_conduct(self) -> Conduct:
+        return find_conduct(self.handover_state, self._vehicle, self._state)
 
     @property
     def outside(self) -> str:

@@ -114,6 +114,70 @@ def test_a_fleet_that_cannot_be_flown_is_refused_with_the_place(
         assert expected_text in error_text
 
 
+CELLS = "distance_m = 0.5\n"
+ROOM = (-2.5, 2.5)
+
+
+def test_vehicles_in_cells_share_one_room(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "fleet.toml"
+    goals = [f"target.position_m=[0.5,{east},-1.2]" for east in (-1.0, 1.0)]
+    path.write_text(
+        CELLS + "".join(make_entry(f"v{i}", ROOM, (A, B)[i], "udpin://127.0.0.1:0", goals[i]) for i in (0, 1))
+    )
+    fleet = read_fleet(path)
+    assert all(member.config.mission.cells for member in fleet.members)
+    assert fleet.cells is not None and fleet.cells.distance_m == fleet.spacing_m == 0.5
+    assert fleet.cells.room_lower_m == pytest.approx([-3.0, -2.5, -2.5])
+    assert run(["fleet", "check", str(path), "--json"]) == 0
+    cells = json.loads(capsys.readouterr().out)["cells"]
+    assert (cells["distance_m"], cells["vertical_distance_m"]) == (0.5, 1.5)
+    assert run(["fleet", "check", str(path)]) == 0
+    assert "1.5 m, for the downwash" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("head", "second_room", "settings", "expected_texts"),
+    [
+        ("", ROOM, (), ("spacing_m, distance_m", "both missing")),
+        (CELLS + HEAD, ROOM, (), ("spacing_m, distance_m", "both given")),
+        (CELLS, (-2.5, 2.4), (), ("vehicle[1]", "room ([sets]), east")),
+        (CELLS, ROOM, ("plant.dt_s=0.1", "daemon.tick_s=0.1"), ("vehicle[1]", "plant.dt_s", "0.05")),
+        (CELLS, ROOM, ("smpc.horizon=40",), ("vehicle[1]", "smpc.horizon is 40, and 48")),
+        (CELLS, ROOM, ("mission.cells=false",), ("vehicle[1]", "mission.cells")),
+        (CELLS, ROOM, ('smpc.controller="x:Y"',), ("vehicle[1]", "smpc", "age-conditioned")),
+        (
+            CELLS,
+            ROOM,
+            ("mission.trajectory={times_s=[0,1],positions_m=[[0,1,-1],[0,1,-1]]}",),
+            ("vehicle[1]", "mission.trajectory", "waypoints"),
+        ),
+        (CELLS, ROOM, ("target.position_m=[0.9,-0.8,-2.0]",), ("vehicle[0]", "v0 and v1", "0.40 m apart")),
+    ],
+)
+def test_vehicles_that_cannot_fly_in_cells_are_refused_with_key_and_remedy(
+    tmp_path: Path,
+    head: str,
+    second_room: tuple[float, float],
+    settings: tuple[str, ...],
+    expected_texts: tuple[str, ...],
+) -> None:
+    path, mocap = tmp_path / "fleet.toml", "udpin://127.0.0.1:0"
+    first = make_entry("v0", ROOM, A, mocap, "target.position_m=[0.5,-1.0,-1.2]")
+    path.write_text(head + first + make_entry("v1", second_room, B, mocap, "target.position_m=[0.5,1,-1.2]", *settings))
+    with pytest.raises(ConfigError) as caught:
+        read_fleet(path)
+    for expected_text in ("fleet.toml:", *expected_texts):
+        assert expected_text in str(caught.value)
+
+
+def test_the_example_of_the_crossing_can_be_flown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["fleet", "check", str(ROOT / "docs" / "examples" / "cross.toml"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert len(document["vehicles"]) == 4 and document["radio"]["carried"] >= 4
+    # They start 1 m apart in `uavctl sim`
+    assert document["cells"]["start_distance_m"] < 1.0
+
+
 def test_a_missing_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["check"], ["status"], ["land"], ["fly", "--out", str(tmp_path / "out")]):
         assert run(["fleet", *command[:1], str(tmp_path / "none.toml"), *command[1:]]) == 2

@@ -29,7 +29,8 @@ from uavctl.daemon.control_socket import (
 from uavctl.daemon.health import Health, RecorderHealth
 from uavctl.errors import UsageError, VehicleTakenError
 from uavctl.event_codes import EventCode
-from uavctl.records import Command, Event, Order, Severity
+from uavctl.fleet.cell import parse_cell
+from uavctl.records import CellMessage, CellReport, Command, Conduct, Event, Order, Severity
 
 SECOND = 1_000_000_000
 CONFIG = load_config("room")
@@ -57,6 +58,8 @@ class Flight:
         self.taken: list[Command] = []
         self._room = room
         self.idle: tuple[Order, ...] = ()
+        self.cells: list[CellMessage] = []
+        self.report: CellReport | None = None
 
     def order(self, command: Command) -> bool:
         if len(self.orders) >= self._room:
@@ -66,6 +69,17 @@ class Flight:
 
     def explain_refusal(self, order: Order) -> str:
         return f"{order} is for nothing" if order in self.idle else ""
+
+    def put_cell(self, cell: CellMessage) -> str:
+        try:
+            parse_cell(cell)
+        except ValueError as error:
+            return str(error)
+        self.cells.append(cell)
+        return ""
+
+    def report_cell(self) -> CellReport | None:
+        return self.report
 
     def tick(self, at_ns: int) -> tuple[tuple[Command, Event], ...]:
         answers = tuple((one, self._decide(one, at_ns)) for one in reversed(self.orders))  # in any order
@@ -85,9 +99,13 @@ class Rig:
     def __init__(self, folder: Path, listener: socket.socket, room: int = 16) -> None:
         self.path = folder / "one.sock"
         self.flight = Flight(room)
-        self.server = ControlServer(listener, CONFIG, self.flight, health)
+        self.permits = 0
+        self.server = ControlServer(listener, CONFIG, self.flight, health, self.permit)
         self.now_ns = 0
         self._clients: list[socket.socket] = []
+
+    def permit(self) -> None:
+        self.permits += 1
 
     def close(self) -> None:
         self.server.close()
@@ -355,3 +373,53 @@ def test_names_and_folders() -> None:
     assert (
         ControlRequest(ask="goto", position_m=(float("inf"), 0.0, 0.0)).find_problem() == "position_m has to be finite"
     )
+
+
+def make_cell(**changes: object) -> dict[str, object]:
+    box = {"lower_m": [[-1.0, -1.0, -2.0]] * 101, "upper_m": [[1.0, 1.0, -0.5123]] * 101}
+    return {"exits": 0, "number": 3, "step": 1_267_000_000, "goal_m": [0.5, 0.0, -1.2], **box, **changes}
+
+
+def test_a_cell_of_the_longest_horizon_reaches_the_flight_and_its_report_comes_back(rig: Rig) -> None:
+    rows = ((0.1, 0.2, -1.0),) * 101
+    rig.flight.report = CellReport(
+        step=7, path_m=rows, margin_m=rows, velocity_mps=(0.0, 0.0, 0.0), goal_m=(1.0, 0.0, -1.0), exits=2, in_use=4,
+        decided=5, conduct=Conduct.CELL, reach_mps2=(1.0, 1.0, 1.0),
+    )  # fmt: skip
+    (client,) = rig.say(ask(ask="cell", cell=make_cell()))
+    rig.ticks()
+    reply = heard(client)
+    assert reply["ok"] and msgspec.convert(reply["report"], CellReport) == rig.flight.report
+    assert rig.flight.cells == [msgspec.convert(make_cell(), CellMessage)]
+    assert rig.permits == 0
+    client.sendall(ask(ask="cell", may_take_off=True))
+    client.setblocking(True)
+    rig.ticks()
+    assert json.loads(client.recv(65_536))["ok"] and len(rig.flight.cells) == 1 and rig.permits == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"lower_m": []}, "0 lower and 101 upper"),
+        ({"lower_m": [[2.0, 0.0, 0.0]] * 101}, "above its upper"),
+        ({"goal_m": [1e300, 0.0, 0.0]}, "beyond"),
+        ({"step": 10**19}, "step"),
+        ({"step": 2**60}, "step"),
+        ({"number": -1}, "number"),
+        ({"goal_m": [0.0, 0.0]}, "not understood"),
+        ({"land": "yes"}, "not understood"),
+    ],
+)
+def test_a_malformed_cell_is_refused_with_the_reason(rig: Rig, changes: dict[str, object], words: str) -> None:
+    (client,) = rig.say(ask(ask="cell", cell=make_cell(**changes), may_take_off=True))
+    rig.ticks()
+    reply = heard(client)
+    assert not reply["ok"] and words in reply["text"]
+    assert not rig.flight.cells and rig.permits == 0
+
+
+def test_an_order_with_a_cell_is_refused(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="hold", cell=make_cell()))
+    rig.ticks()
+    assert "takes no cell" in heard(client)["text"] and not rig.flight.orders

@@ -1,8 +1,10 @@
-"""Command `uavctl fleet`: several vehicles from one file, each in a box of its own, landed together.
+"""Command `uavctl fleet`: several vehicles from one file, landed together.
 
-Each vehicle has a daemon, a process of its own, so an error in one does not reach the others. Plans stay within the
-limits of their configuration, so vehicles with separate limits stay separate. A file whose boxes are too near is
-refused before anything is sent. If one vehicle ends otherwise than requested, its position is unknown: all others land.
+Each vehicle has a daemon, a process of its own, so an error in one does not reach the others.
+1. With `spacing_m` each has a box of its own. Plans stay within the limits of their configuration, so vehicles with
+   separate limits stay separate. A file whose boxes are too near is refused before anything is sent.
+2. With `distance_m` all share one room, in moving cells; a thread of this process coordinates them.
+If one vehicle ends otherwise than requested, its position is unknown: all others land.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, zip_longest
@@ -28,24 +30,32 @@ from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
+from logs.recording.coordinator import CoordinatorRecording, make_cycle_record
 from uavctl.arrays import SECOND_NS
+from uavctl.cell_report import COLUMN_M
 from uavctl.cli import main
 from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, make_key_overrides
 from uavctl.cli.ctl import send_request
 from uavctl.cli.fleet_view import ShownVehicle, choose_ports, show_fleet_page
 from uavctl.cli.flying import LivePort, check_take_off, choose_live_port, print_warning, run_page_process
 from uavctl.cli.health_lines import hide_health_lines
-from uavctl.cli.output import make_message_console, make_table, print_message
+from uavctl.cli.output import make_message_console, make_pair_table, make_table, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.usage import format_example
+from uavctl.clock import read_zero_utc_ns
 from uavctl.config import Config, load
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.load import read_document
-from uavctl.daemon.control_socket import ControlRequest, find_control_folder, make_daemon_name
+from uavctl.daemon.cell_exchange import CellExchange, ExchangedVehicle, run_exchange
+from uavctl.daemon.control_socket import ControlRequest, find_control_folder, make_daemon_name, make_socket_path
 from uavctl.daemon.health import Health
-from uavctl.errors import ConfigError, NotReachedError, UavctlError
+from uavctl.errors import ConfigError, NotReachedError, UavctlError, in_words
+from uavctl.fleet.boxes import DOWNWASH
+from uavctl.fleet.coordinator import CellParameters
 from uavctl.flight.limits import AXES
+from uavctl.records import Vec3
+from uavctl.wiring.cells import Coordinator, build_cell_parameters, find_fleet_problems
 from uavctl.wiring.radio import (
     RadioConfig,
     RadioLoad,
@@ -60,6 +70,9 @@ POLL_S = 0.1  # between two checks of their processes
 TABLE_PERIOD_S = 5.0  # between two tables where there is no terminal
 MAX_VEHICLES = 20
 MAX_NAME_LENGTH = 30
+REST_S = 3.0  # longest time to come to rest in cells before the landing: a plan is 2.4 s long
+COORDINATOR_FILE = "coordinator.mcap"
+CELLS_OVERRIDE = "mission.cells=true"
 
 fleet_app = App(
     name="fleet",
@@ -70,7 +83,7 @@ fleet_app = App(
 FleetLive = Annotated[
     bool, Parameter(negative=(), help="show all vehicles on one page to browsers on this machine, and each on its own")
 ]
-File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] table for each vehicle")]
+File = Annotated[Path, Parameter(help="TOML file: spacing_m or distance_m, and a [[vehicle]] table for each vehicle")]
 
 
 class FleetVehicle(Section, frozen=True, kw_only=True):
@@ -88,7 +101,9 @@ class FleetVehicle(Section, frozen=True, kw_only=True):
 class FleetFile(Section, frozen=True, kw_only=True):
     """A fleet as its file describes it."""
 
-    spacing_m: Annotated[float, Meta(gt=0.0, le=1000.0)]  # smallest horizontal distance of two vehicles' limits
+    # Exactly one of them
+    spacing_m: Annotated[float, Meta(gt=0.0, le=1000.0)] | None = None  # least horizontal distance of vehicles' limits
+    distance_m: Annotated[float, Meta(gt=0.0, le=1000.0)] | None = None  # horizontal distance in moving cells
     vehicle: Annotated[tuple[FleetVehicle, ...], Meta(max_length=MAX_VEHICLES)]
     radio: RadioConfig = RadioConfig()  # the channel that carries the positions of all
 
@@ -118,12 +133,13 @@ HealthByName = dict[str, Health | None]  # None where no daemon answers
 
 @dataclass(frozen=True)
 class Fleet:
-    """The vehicles of a file, with separate limits."""
+    """The vehicles of a file, with separate limits or in moving cells."""
 
     members: tuple[Member, ...]
     nearest_m: float  # smallest horizontal distance of two vehicles' limits; infinite for a single one
     radio: RadioConfig
-    spacing_m: float
+    spacing_m: float  # horizontal distance that vehicles keep, by their limits or by their cells
+    cells: CellParameters | None = None  # of the coordinator; None: separate limits
 
 
 def read_fleet(path: Path) -> Fleet:
@@ -137,16 +153,21 @@ def read_fleet(path: Path) -> Fleet:
         file_problems.append(ConfigProblem("vehicle", "there is none", "write a [[vehicle]] table for each"))
     if document is not None:
         file_problems += find_radio_problems(document.radio, len(document.vehicle))
+        if (document.spacing_m is None) == (document.distance_m is None):
+            reason = "are both given" if document.distance_m is not None else "are both missing"
+            todo = "give spacing_m, for a box each, or distance_m, for moving cells in one room"
+            file_problems.append(ConfigProblem("spacing_m, distance_m", reason, todo))
     if document is None or file_problems:
         raise ConfigError(tuple(source.describe(problem) for problem in file_problems))
     config_problems: list[str] = []
     members: list[Member] = []
-    radio_overrides = make_link_overrides(document.radio, len(document.vehicle)) if document.radio.has_budget else []
+    shared_overrides = make_link_overrides(document.radio, len(document.vehicle)) if document.radio.has_budget else []
+    shared_overrides += [CELLS_OVERRIDE] if document.distance_m is not None else []
     for number, vehicle in enumerate(document.vehicle):
         path_beside = path.parent / vehicle.config
         config = str(path_beside) if vehicle.config.endswith(".toml") else vehicle.config
         urls = make_key_overrides(daemon__vehicle=vehicle.vehicle, daemon__mocap=vehicle.mocap)
-        overrides = [*radio_overrides, *vehicle.set, *urls]
+        overrides = [*shared_overrides, *vehicle.set, *urls]
         try:
             loaded = load(config, overrides).config
         except ConfigError as error:
@@ -156,11 +177,15 @@ def read_fleet(path: Path) -> Fleet:
             continue
         options = ("--config", config, *(part for override in overrides for part in ("--set", override)))
         members.append(Member(vehicle.name, options, loaded, vehicle.cameras, vehicle.positions))
-    fleet_problems = list(_find_problems(members, document.spacing_m))
+    fleet_problems = [*_find_name_problems(members), *_find_place_problems(document, members)]
     if config_problems or fleet_problems:
         raise ConfigError((*config_problems, *(source.describe(problem) for problem in fleet_problems)))
     pairs = [compute_gap_m(vehicle, second) for vehicle, second in combinations(members, 2)]
-    return Fleet(tuple(members), min(pairs, default=math.inf), document.radio, document.spacing_m)
+    nearest_m, configs = min(pairs, default=math.inf), [member.config for member in members]
+    if document.distance_m is None:
+        return Fleet(tuple(members), nearest_m, document.radio, document.spacing_m or 0.0)
+    cells = build_cell_parameters(configs, document.distance_m)
+    return Fleet(tuple(members), nearest_m, document.radio, document.distance_m, cells)
 
 
 def compute_gap_m(first: Member, second: Member) -> float:
@@ -175,7 +200,8 @@ def compute_gap_m(first: Member, second: Member) -> float:
     return max(gaps)
 
 
-def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[ConfigProblem]:
+def _find_name_problems(members: Sequence[Member]) -> Iterator[ConfigProblem]:
+    """Find vehicles that share a name or a link."""
     for (number, first), (_, second) in combinations(enumerate(members), 2):
         key = f"vehicle[{number}]"
         if first.name == second.name:
@@ -189,6 +215,21 @@ def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[Conf
         elif first.daemon == second.daemon:
             reason = f"the daemons of {first.name} and {second.name} would both be named {first.daemon}"
             yield ConfigProblem(key, reason, "give their configurations names that differ early")
+
+
+def _find_place_problems(document: FleetFile, members: Sequence[Member]) -> Iterator[ConfigProblem]:
+    """Find boxes that are too near, or what keeps vehicles from flying in cells."""
+    if document.distance_m is not None:
+        for number, member in enumerate(members):
+            if not member.config.mission.cells:
+                reason = f"{member.name}: mission.cells is false, and distance_m is for vehicles in cells"
+                yield ConfigProblem(f"vehicle[{number}]", reason, "remove mission.cells from `set`")
+        yield from find_fleet_problems([member.config for member in members]) if members else ()
+        for (number, first), (_, second) in combinations(enumerate(members), 2):
+            yield from _find_goal_problems(f"vehicle[{number}]", first, second, document.distance_m)
+        return
+    spacing_m = document.spacing_m or 0.0
+    for first, second in combinations(members, 2):
         gap_m = compute_gap_m(first, second)
         if gap_m < spacing_m:
             relation = f"{gap_m:.2f} m apart" if gap_m >= 0 else f"overlap by {-gap_m:.2f} m"
@@ -198,6 +239,29 @@ def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[Conf
                 f"{spacing_m:g} m is asked for",
                 "move sets.state_lower and sets.state_upper of one of them",
             )
+
+
+def _find_goal_problems(key: str, first: Member, second: Member, distance_m: float) -> Iterator[ConfigProblem]:
+    """Find two vehicles whose last places are too near: the later one would never arrive."""
+    places = [_get_last_place(member.config) for member in (first, second)]
+    if places[0] is None or places[1] is None:
+        return
+    offsets_m = [abs(a - b) for a, b in zip(*places, strict=True)][:2]
+    if max(offsets_m) < distance_m:
+        yield ConfigProblem(
+            key,
+            f"the last places of {first.name} and {second.name} are {max(offsets_m):.2f} m apart north or east, "
+            f"{distance_m:g} m is asked for",
+            "move target.position_m or mission.waypoints of one of them",
+        )
+
+
+def _get_last_place(config: Config) -> Vec3 | None:
+    """Return the place at which a mission ends; None if it goes on for ever, or with a landing."""
+    mission = config.mission
+    if mission.then != "hold":
+        return None
+    return mission.waypoints[-1] if mission.waypoints else config.target.position_m
 
 
 @fleet_app.command(help_epilogue=format_example("fleet check"))
@@ -216,6 +280,8 @@ def check(file: File, /, *, json: QuietJson = False) -> int:
         ],
         "nearest_m": fleet.nearest_m if math.isfinite(fleet.nearest_m) else None,
     }
+    if fleet.cells is not None:
+        document["cells"] = _describe_cells(fleet.cells)
     if fleet.radio.has_budget:
         document["radio"] = {
             "slot_s": compute_slot_ns(fleet.radio) / SECOND_NS,
@@ -224,7 +290,7 @@ def check(file: File, /, *, json: QuietJson = False) -> int:
         }
 
     def make_tables() -> Group:
-        tables = [_make_box_table(fleet)]
+        tables = [_make_box_table(fleet)] if fleet.cells is None else [_make_room_table(fleet, fleet.cells)]
         if fleet.radio.has_budget:
             tables.append(_make_radio_table(fleet.radio, len(fleet.members), carried, loads))
         return Group(*tables)
@@ -251,6 +317,7 @@ def fly(
     """Fly all vehicles of a file, each by a daemon of its own; Ctrl-C lands them all, or hands them over.
 
     When one ends otherwise than it was asked to, the others are landed, too. Exit code: the largest of theirs.
+    With `distance_m` all first come to rest in their cells. `coordinator.mcap` has each cycle of the coordinator.
     """
     check_take_off(arm, takeoff)
     view_port = choose_live_port(live=live, port=live_port)
@@ -262,21 +329,20 @@ def fly(
         FleetFlight(member, [*options, "--out", str(out / member.name), *_make_live_options(port)])
         for member, port in zip_longest(fleet.members, ports)
     ]
+    coordination: Coordination | None = None
     with (
         stop_on_signals() as stopped,
         _show_status(flights) as health,
         _open_page(f"uavctl fleet: {file.stem}", view_port, flights, ports, health),
+        ExitStack() as stack,
     ):
+        if fleet.cells is not None:
+            coordination = stack.enter_context(coordinate(fleet, fleet.cells, out / COORDINATOR_FILE))
         for flight in flights:
             flight.start()
-        is_landing = False
+        end = FleetEnd(flights, coordination)
         while any(flight.is_running() for flight in flights):
-            reason = "ordered" if stopped() else _find_failure(flights, health)
-            if reason and not is_landing:
-                is_landing = True
-                print_message(f"{reason}: all vehicles end their flights")
-                for flight in flights:
-                    flight.request_fallback()
+            end.update("ordered" if stopped() else _find_failure(flights, health))
             time.sleep(POLL_S)
         for flight in flights:
             flight.join_output()
@@ -289,7 +355,8 @@ def fly(
         "report": None if page is None else str(page),
     }
     Common(json=json).show("fleet/fly", document, lambda: _make_exit_table(flights))
-    return max((flight.exit_code or 0 for flight in flights), default=0)
+    code = max((flight.exit_code or 0 for flight in flights), default=0)
+    return code if coordination is None or not coordination.problem else max(code, 1)
 
 
 @fleet_app.command(help_epilogue=format_example("fleet status"))
@@ -416,6 +483,92 @@ class FleetFlight:
                     print_message(f"{self.member.name}: {text}", highlight=False)
 
 
+class FleetEnd:
+    """The end of all flights, for the first reason that there is.
+
+    Vehicles in cells first come to rest. Braking would leave the cells, and two that fly to each other would meet.
+    """
+
+    def __init__(self, flights: Sequence[FleetFlight], coordination: Coordination | None) -> None:
+        self._flights, self._coordination = flights, coordination
+        self._begun_s: float | None = None
+        self._is_requested = False
+
+    def update(self, reason: str) -> None:
+        """Begin the end if there is a reason, and request the landings once they are due."""
+        if self._coordination is not None:
+            reason = reason or self._coordination.problem
+        if self._begun_s is None and reason:
+            self._begun_s = time.monotonic()
+            print_message(f"{reason}: all vehicles end their flights", highlight=False)
+            if self._coordination is not None:
+                self._coordination.exchange.hold()
+        if self._begun_s is None or self._is_requested or not self._may_land(self._begun_s):
+            return
+        self._is_requested = True
+        for flight in self._flights:
+            flight.request_fallback()
+
+    def _may_land(self, begun_s: float) -> bool:
+        coordination = self._coordination
+        if coordination is None or coordination.problem or coordination.exchange.is_at_rest:
+            return True
+        return time.monotonic() - begun_s >= REST_S
+
+
+class Coordination:
+    """The coordinator of the moving cells, in a thread of its own.
+
+    Attributes:
+        exchange: with the daemons.
+        failure: error of the thread; empty without one.
+    """
+
+    def __init__(self, exchange: CellExchange) -> None:
+        self.exchange, self.failure = exchange, ""
+
+    @property
+    def problem(self) -> str:
+        """Why the flights have to end; empty without a reason."""
+        return self.failure or self.exchange.problem
+
+    def run(self, is_over: Callable[[float], bool]) -> None:
+        """Run until the end; an error is a failure."""
+        try:
+            run_exchange(self.exchange, is_over)
+        except Exception as error:  # noqa: BLE001 the vehicles hold in their last cells, and then all land
+            self.failure = f"the coordinator has failed ({in_words(error)})"
+
+
+@contextmanager
+def coordinate(fleet: Fleet, parameters: CellParameters, path: Path) -> Iterator[Coordination]:
+    """Coordinate the vehicles from a thread, and record each cycle.
+
+    Raises:
+        RecordingError: There is such a file, or it cannot be made.
+    """
+    folder, coordinator = find_control_folder(None), Coordinator(parameters, len(fleet.members))
+    names = [member.name for member in fleet.members]
+
+    with CoordinatorRecording(path, read_zero_utc_ns()) as recording:
+
+        def record(at_ns: int) -> None:
+            if coordinator.state is not None:
+                recording.add(make_cycle_record(at_ns, coordinator.state, parameters, names))
+
+        sockets = [make_socket_path(folder, member.daemon) for member in fleet.members]
+        vehicles = [ExchangedVehicle(name, path) for name, path in zip(names, sockets, strict=True)]
+        coordination = Coordination(CellExchange(coordinator, vehicles, record, print_message))
+        done = threading.Event()
+        thread = threading.Thread(target=coordination.run, args=(done.wait,), name="cells", daemon=True)
+        thread.start()
+        try:
+            yield coordination
+        finally:
+            done.set()
+            thread.join(TABLE_PERIOD_S)
+
+
 def run_fleet_daemon() -> None:
     """Run the command line as a daemon of a fleet; raise Ctrl-C once standard input is closed.
 
@@ -491,9 +644,11 @@ def _read_health(member: Member, folder: Path) -> Health | None:
 
 def _make_status_table(health_by_name: HealthByName) -> Table:
     rows = []
+    in_cells = any(health is not None and health.cell is not None for health in health_by_name.values())
+    distances_m = find_nearest_m(health_by_name)
     for name, health in health_by_name.items():
         if health is None:
-            rows.append([name, "-", "no daemon answers", "-", "-", "-"])
+            rows.append([name, "-", "no daemon answers", "-", "-", "-", *(["-"] * 3 if in_cells else [])])
             continue
         vehicle = health.vehicle
         position = health.position_m
@@ -507,8 +662,58 @@ def _make_status_table(health_by_name: HealthByName) -> Table:
                 "-" if position is None else ", ".join(f"{value:+.2f}" for value in position.values()),
             ]
         )
+        if in_cells:
+            distance_m = distances_m.get(name)
+            rows[-1] += [
+                str(health.cell or "-"),
+                health.conduct or "-",
+                "-" if distance_m is None else f"{distance_m:.2f}",
+            ]
     headings = ("vehicle", "mode", "in control", "autopilot", "age", "position NED [m]")
-    return make_table("", headings, rows, headings[:4], fold=True)
+    more = ("cell", "moves", "nearest [m]") if in_cells else ()
+    return make_table("", (*headings, *more), rows, (*headings[:4], *more[1:2]), fold=True)
+
+
+def find_nearest_m(health_by_name: HealthByName) -> dict[str, float]:
+    """Find the distance of each vehicle to the nearest other one [m], by their estimates; without height."""
+    places = {
+        name: health.position_m
+        for name, health in health_by_name.items()
+        if health is not None and health.position_m is not None
+    }
+    nearest_m: dict[str, float] = {}
+    for (name, place), (other_name, other) in combinations(places.items(), 2):
+        apart_m = math.hypot(*(place[axis] - other[axis] for axis in AXES[:2] if axis in place and axis in other))
+        for one in (name, other_name):
+            nearest_m[one] = min(apart_m, nearest_m.get(one, math.inf))
+    return nearest_m
+
+
+def _describe_cells(cells: CellParameters) -> dict[str, float]:
+    """Describe what the distance of moving cells means; lengths in metres."""
+    return {
+        "distance_m": cells.distance_m,
+        "vertical_distance_m": DOWNWASH * cells.distance_m,
+        "margin_m": cells.margin_m,
+        "start_distance_m": cells.distance_m + 2.0 * (COLUMN_M + cells.margin_m),
+        "silence_s": cells.silence_s,
+    }
+
+
+def _make_room_table(fleet: Fleet, cells: CellParameters) -> Table:
+    figures = _describe_cells(cells)
+    texts = {
+        "vehicles": ", ".join(member.name for member in fleet.members),
+        **{
+            f"{axis} [m]": f"{low:g} to {high:g}"
+            for axis, low, high in zip(AXES, cells.room_lower_m, cells.room_upper_m, strict=True)
+        },
+        "cells apart, north or east": f"{figures['distance_m']:g} m",
+        "or in height": f"{figures['vertical_distance_m']:g} m, for the downwash",
+        "centres apart in flight": f"more: each cell also holds its plan's margins and {figures['margin_m']:g} m",
+        "centres apart at the start": f"{figures['start_distance_m']:.2f} m, north or east",
+    }
+    return make_pair_table("one room for all: moving cells", list(texts.items()))
 
 
 def _make_box_table(fleet: Fleet) -> Table:

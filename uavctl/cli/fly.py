@@ -129,7 +129,8 @@ def fly_daemon(
         UavctlError: Nothing was flown; the message is the reason.
     """
     config = loaded.config
-    orders = FlightOrders(config, take_off_m=take_off_m, goto=goto, follower=follower)
+    in_cells = config.mission.cells
+    orders = FlightOrders(config, take_off_m=take_off_m, goto=goto, follower=follower, waits_for_fleet=in_cells)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     # The lock comes first: it refuses a second daemon at once.
     with (
@@ -172,9 +173,13 @@ def fly_daemon(
                     order_stand_by(loop, vehicle_lock.left_flight_ns)
                 on_stop = "brakes and lands" if config.fallback.land else "brakes, then leaves the vehicle to the pilot"
                 print_message(f"recording to {path}; Ctrl-C {on_stop}")
+                if orders.takes_off and in_cells:
+                    print_message("the take-off waits for the coordinator of the cells: `uavctl fleet fly`")
                 with (
                     show_live_line(loop, recorder.status, duration_s, config.daemon.tick_s) as feed,
-                    run_services(loop, config, path, recorder.status, listener) as service_functions,
+                    run_services(
+                        loop, config, path, recorder.status, listener, orders.permit_take_off
+                    ) as service_functions,
                     record_failure(loop),
                     limit_ticks(ENGAGED_LIMIT_S if config.smpc.controller else LIMIT_S) as tick_limit,
                     guard_landing(loop, config, connections[VEHICLE], path, print_warning) as guard_functions,

@@ -24,7 +24,12 @@ from uavctl.loop import ControlLoop
 
 @contextmanager
 def run_services(
-    loop: ControlLoop, config: Config, path: Path, status: Callable[[], RecorderStatus], listener: socket.socket
+    loop: ControlLoop,
+    config: Config,
+    path: Path,
+    status: Callable[[], RecorderStatus],
+    listener: socket.socket,
+    permit_take_off: Callable[[], None],
 ) -> Iterator[Sequence[AfterTick]]:
     """Yield the functions that the daemon calls after each tick; close the services at the end.
 
@@ -42,7 +47,7 @@ def run_services(
 
     identity = (make_daemon_name(config), config.daemon.vehicle, os.getpid())
     monitor = HealthMonitor(loop, config, identity, get_recorder_health, report_health)
-    server = ControlServer(listener, config, loop, monitor.make_health)
+    server = ControlServer(listener, config, loop, monitor.make_health, permit_take_off)
     try:
         # The sign of life comes last: it confirms all work of the tick.
         yield monitor.after_tick, server.after_tick, notifier.after_tick

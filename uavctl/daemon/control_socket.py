@@ -1,8 +1,8 @@
 """Orders of the operator in flight: a Unix socket that the daemon reads after each tick without waiting.
 
 Each direction carries one JSON object a line: a `ControlRequest`, then its `Reply`. The reply to an order holds what
-the next tick decided. File permissions protect the socket (folder 0700, socket 0600). The kernel also reports the user
-at the other end.
+the next tick decided, the `CellReply` to a cell the report of the vehicle. File permissions protect the socket (folder
+0700, socket 0600). The kernel also reports the user at the other end.
 """
 
 from __future__ import annotations
@@ -27,20 +27,22 @@ from uavctl.daemon.health import Health
 from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
 from uavctl.event_codes import EventCode
-from uavctl.records import Command, Event, Order, Ticked, Vec3
+from uavctl.records import CellMessage, CellReport, Command, Event, Order, Ticked, Vec3
 
 FOLDER_VARIABLE = "UAVCTL_CONTROL"
 SUFFIX = ".sock"
-MAX_LINE = 4096  # bytes of a request
+MAX_LINE = 65_536  # bytes of a request; a cell of 101 boxes, the most there are, has some 20,000
 _MAX_NAME = 48  # characters of a daemon's name
 _MAX_PATH = 107  # bytes that the kernel takes for the path of a socket
 
 
 class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Status request or order."""
+    """Status request, order, or cell of the coordinator."""
 
-    ask: Literal["goto", "hold", "resume", "land", "engage", "status"]
+    ask: Literal["goto", "hold", "resume", "land", "engage", "status", "cell"]
     position_m: Vec3 | None = None  # local NED; with goto only
+    cell: CellMessage | None = None  # with cell only; None: the report alone is wanted
+    may_take_off: bool = False  # with cell only: all vehicles are known, and stand apart
 
     def find_problem(self) -> str | None:
         """Return the error in the request itself; None without one."""
@@ -48,6 +50,8 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
         if self.position_m is not None and not all(map(math.isfinite, self.position_m)):
             return "position_m has to be finite"
+        if self.ask != "cell" and (self.cell is not None or self.may_take_off):
+            return f"{self.ask} takes no cell"
         return None
 
 
@@ -57,6 +61,14 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
     ok: bool
     text: str
     status: Health | None = None
+
+
+class CellReply(msgspec.Struct, frozen=True, kw_only=True):
+    """Reply to a cell: whether it is well-formed, and the report of the vehicle."""
+
+    ok: bool
+    text: str
+    report: CellReport | None = None  # None before its position is known
 
 
 def make_daemon_name(config: Config) -> str:
@@ -109,6 +121,14 @@ class OrderReceiver(Protocol):
         """Return why an order would have no effect now; empty if it may be given."""
         ...
 
+    def put_cell(self, cell: CellMessage) -> str:
+        """Put a moving cell for the next tick; return why it is refused, empty if it is not."""
+        ...
+
+    def report_cell(self) -> CellReport | None:
+        """Report to the coordinator of the cells; None before the position is known."""
+        ...
+
 
 @dataclass(eq=False)
 class _Client:
@@ -122,17 +142,19 @@ class ControlServer:
 
     Args:
         config: For the limits of a position.
+        permit_take_off: Called once the coordinator of the cells permits the take-off.
     """
 
     def __init__(
-        self, listener: socket.socket, config: Config, order_receiver: OrderReceiver, make_health: Callable[[], Health]
+        self,
+        listener: socket.socket,
+        config: Config,
+        order_receiver: OrderReceiver,
+        make_health: Callable[[], Health],
+        permit_take_off: Callable[[], None] = lambda: None,
     ) -> None:
-        self._listener, self._config, self._order_receiver, self._make_health = (
-            listener,
-            config,
-            order_receiver,
-            make_health,
-        )
+        self._listener, self._config, self._order_receiver = listener, config, order_receiver
+        self._make_health, self._permit_take_off = make_health, permit_take_off
         self._clients: list[_Client] = []
         self._pending: list[tuple[_Client, Command]] = []  # for the next tick's answers
 
@@ -209,6 +231,9 @@ class ControlServer:
         if request.ask == "status":
             self._reply(client, Reply(ok=True, text="", status=self._make_health()))
             return
+        if request.ask == "cell":
+            self._reply(client, self._exchange_cell(request))
+            return
         problem = (
             request.find_problem()
             or self._check_position(request)
@@ -224,6 +249,17 @@ class ControlServer:
         else:
             self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
 
+    def _exchange_cell(self, request: ControlRequest) -> CellReply:
+        """Put the cell of the coordinator, and return the report for it."""
+        problem = request.find_problem() or ""
+        if not problem and request.cell is not None:
+            problem = self._order_receiver.put_cell(request.cell)
+        if problem:
+            return CellReply(ok=False, text=problem)
+        if request.may_take_off:
+            self._permit_take_off()
+        return CellReply(ok=True, text="", report=self._order_receiver.report_cell())
+
     def _check_position(self, request: ControlRequest) -> str | None:
         """Return the coordinates of a position outside the limits; None if it is inside, or there is none."""
         if request.position_m is None:
@@ -233,7 +269,7 @@ class ControlServer:
         hints = dict.fromkeys(problem.todo for problem in problems)
         return "; ".join([*(problem.reason for problem in problems), *hints]) or None
 
-    def _reply(self, client: _Client, reply: Reply) -> None:
+    def _reply(self, client: _Client, reply: Reply | CellReply) -> None:
         data = msgspec.json.encode(reply) + b"\n"
         try:
             sent = client.socket.send(data)

@@ -50,16 +50,24 @@ class FlightOrders:
         take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
         goto: whether the mission is the position of `--goto`.
         follower: called after each tick; it may give orders.
+        waits_for_fleet: whether the take-off is only ordered once `permit_take_off` was called.
     """
 
     def __init__(
-        self, config: Config, *, take_off_m: float | None, goto: bool, follower: TickFollower | None = None
+        self,
+        config: Config,
+        *,
+        take_off_m: float | None,
+        goto: bool,
+        follower: TickFollower | None = None,
+        waits_for_fleet: bool = False,
     ) -> None:
         self._config = config
         self._take_off_m = take_off_m
         self._follower = follower
         self.goal: Vec3 | None = config.mission.waypoints[0] if goto else None
         self._is_take_off_ordered = False
+        self._is_take_off_permitted = not waits_for_fleet
         self.has_engaged = False
         self.has_arrived = False
 
@@ -74,14 +82,19 @@ class FlightOrders:
         loop.account.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
 
     def handle_tick(self, loop: ControlLoop, ticked: Ticked) -> None:
-        """Update after a tick; after the first one, order the take-off."""
+        """Update after a tick; once it is permitted, order the take-off."""
         self.has_engaged = self.has_engaged or loop.handover_state is HandoverState.ENGAGED
         self._check_arrival(loop, ticked)
         loop.account.has_arrived = self.has_arrived
-        if self._take_off_m is not None and not self._is_take_off_ordered:
+        is_due = self._is_take_off_permitted and not self._is_take_off_ordered
+        if self._take_off_m is not None and is_due:
             self._is_take_off_ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
         if self._follower is not None:
             self._follower(loop, ticked)
+
+    def permit_take_off(self) -> None:
+        """Permit the take-off."""
+        self._is_take_off_permitted = True
 
     def _check_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
         estimate = ticked.estimate

@@ -12,7 +12,7 @@ from uavctl.account import FlightAccount
 from uavctl.config import Config
 from uavctl.config.checks import get_position_index
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.records import ControlMode, RelayStats, Ticked, Vector, VehicleStatus
+from uavctl.records import Conduct, ControlMode, RelayStats, Ticked, Vector, VehicleStatus
 
 PERIOD_NS = 1_000_000_000
 LOSS_PERIODS = 10  # over which losses are counted
@@ -78,6 +78,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     let_go: str = ""  # why the envelope has let the vehicle go; empty as long as it has not
     # share of the vehicle's inertial data of the last second that are used; None where none came, or none are wanted
     inertial: float | None = None
+    cell: int | None = None  # number of the moving cell in use, 0 without one; None in a flight without any
+    conduct: Conduct | None = None  # how a vehicle in moving cells moves
 
 
 class MonitoredFlight(Protocol):
@@ -103,6 +105,11 @@ class MonitoredFlight(Protocol):
     @property
     def breach_reason(self) -> str:
         """Reason why the envelope has let the vehicle go; empty while it has not."""
+        ...
+
+    @property
+    def cell_status(self) -> tuple[int, Conduct] | None:
+        """Number of the moving cell in use, and conduct; None in a flight without any."""
         ...
 
 
@@ -197,6 +204,7 @@ class HealthMonitor:
         )
         mean = None if estimate is None else estimate.mean
         name, url, pid = self._identity
+        cell, conduct = flight.cell_status or (None, None)
         return Health(
             name=name,
             url=url,
@@ -220,6 +228,8 @@ class HealthMonitor:
             relay=self._make_relay_health(),
             let_go=flight.breach_reason,
             inertial=self._inertial_share,
+            cell=cell,
+            conduct=conduct,
         )
 
     def _make_relay_health(self) -> RelayHealth | None:

@@ -22,6 +22,8 @@ from uavctl.records import CellMessage, CellReport, Conduct, Vec3
 KEPT_TOLERANCE_M = 1e-6  # excess of a plan over a cell that is rounding of its program
 STEP_TOLERANCE = 1e-6  # part of a step that is rounding of a time
 NO_CELL = 0  # number without a cell
+MAX_PLACE_M = 1e5  # largest coordinate of a cell, for flights far larger than any room
+MAX_STEP = 2**53  # largest step, number or count: exact as a float, and some millions of years
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,13 +142,17 @@ def parse_cell(message: CellMessage) -> MovingCell:
     """Return the cell of a message.
 
     Raises:
-        ValueError: It has no box, sides of different length, or a number that is not finite.
+        ValueError: It has no box, sides of different length or on the wrong side, or a number that is too large.
     """
     lower_m, upper_m, goal_m = np.array(message.lower_m), np.array(message.upper_m), np.array(message.goal_m)
+    if not all(0 <= count <= MAX_STEP for count in (message.step, message.number, message.exits)):
+        raise ValueError("a cell has a step, number or count of exits that is none")
     if not len(lower_m) or lower_m.shape != upper_m.shape:
         raise ValueError(f"a cell of {len(lower_m)} lower and {len(upper_m)} upper sides is none")
-    if not (np.isfinite(lower_m).all() and np.isfinite(upper_m).all() and np.isfinite(goal_m).all()):
-        raise ValueError("a cell has sides or a goal that are not finite")
+    if not all((np.abs(places_m) <= MAX_PLACE_M).all() for places_m in (lower_m, upper_m, goal_m)):
+        raise ValueError(f"a cell has sides or a goal beyond {MAX_PLACE_M:g} m")
+    if (lower_m > upper_m).any():
+        raise ValueError("a cell has a lower side above its upper side")
     return MovingCell(message.number, message.step, lower_m, upper_m, goal_m, message.land, message.exits)
 
 

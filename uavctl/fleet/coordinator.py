@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -57,6 +58,18 @@ class CellParameters:
     silence_s: float = 1.0  # time without a report after which a vehicle counts as an obstacle
 
 
+class Wait(StrEnum):
+    """Reason why a vehicle was issued no new cell in a cycle."""
+
+    NONE = ""  # it was issued one
+    SILENT = "silent"  # its newest report is too old
+    NO_PLANS = "no plans"  # it does not fly by plans: on the ground, in its own climb or landing, or free
+    BLOCKED = "blocked"  # its path is too near to another vehicle's claim
+    UNDIVIDED = "undivided"  # no axis divides its claim from that of another vehicle in all stages
+    NO_ROOM = "no room"  # the planes leave nothing
+    UNDECIDED = "undecided"  # it has not decided about its newest cell
+
+
 @dataclass(frozen=True, eq=False)
 class CoordinatorState:
     """State of the coordinator; boxes begin at `step`."""
@@ -70,6 +83,7 @@ class CoordinatorState:
     reports: tuple[Report, ...]  # newest report of each vehicle
     goals_m: Array  # place that each vehicle is to reach (N, 3)
     exits: tuple[int, ...]  # times that each vehicle has left its cell
+    waits: tuple[Wait, ...] = ()  # of the last cycle, one a vehicle
 
     @property
     def claims(self) -> Boxes:
@@ -146,6 +160,23 @@ def begin_without_cells(step: int, reports: Sequence[Report], parameters: CellPa
     return replace(state, goals_m=_take_goals(state))
 
 
+def find_near_starts(reports: Sequence[Report], parameters: CellParameters) -> list[tuple[int, int, float]]:
+    """Find the pairs whose places with their margins are nearer than the distance, and the distance to place them at.
+
+    The distance holds north or east: vehicles that start do not fly above each other.
+    """
+    near = []
+    for second in range(len(reports)):
+        for first in range(second):
+            plans = [reports[i].plan for i in (first, second)]
+            half_m = plans[0].margin_m[0] + plans[1].margin_m[0] + 2.0 * parameters.margin_m
+            needed_m = parameters.distance_m + half_m[:2]
+            offset_m = np.abs(plans[1].mean_m[0] - plans[0].mean_m[0])[:2]
+            if (offset_m < needed_m - ROUNDING_M).all():
+                near.append((first, second, float(needed_m.max())))
+    return near
+
+
 def advance(state: CoordinatorState, step: int) -> CoordinatorState:
     """Advance the boxes to a later step."""
     steps = step - state.step
@@ -215,8 +246,16 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     # A vehicle that must land has its first such cell at once
     is_told = np.array([cell.land for cell in state.newest], dtype=bool)
     takes_cells = np.array([report.conduct in (Conduct.CELL, Conduct.REST) for report in state.reports], dtype=bool)
-    is_new = takes_cells & ~is_silent & ~is_blocked & bounds.is_divided & ~cells.is_empty
-    is_new &= state.is_decided | (must_land & ~is_told)
+    reasons = {
+        Wait.SILENT: is_silent,
+        Wait.NO_PLANS: ~takes_cells,
+        Wait.BLOCKED: is_blocked,
+        Wait.UNDIVIDED: ~bounds.is_divided,
+        Wait.NO_ROOM: cells.is_empty,
+        Wait.UNDECIDED: ~(state.is_decided | (must_land & ~is_told)),
+    }
+    waits = tuple(next((wait for wait, flags in reasons.items() if flags[i]), Wait.NONE) for i in range(len(is_silent)))
+    is_new = np.array([wait is Wait.NONE for wait in waits], dtype=bool)
     newest = tuple(
         MovingCell(
             cell.number + 1, step, cells.lower_m[i], cells.upper_m[i], guides_m[i], bool(must_land[i]), state.exits[i]
@@ -227,7 +266,7 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     )
     previous = tuple(state.newest[i] if is_new[i] else cell for i, cell in enumerate(state.previous))
     pending = state.pending.cover(cells).take(is_new, state.pending)
-    return replace(state, pending=pending, newest=newest, previous=previous)
+    return replace(state, pending=pending, newest=newest, previous=previous, waits=waits)
 
 
 def _gather_claims(
@@ -248,6 +287,16 @@ def _gather_claims(
         if not is_blocked[i]:
             claims = claims.cover(path)
     return claims, is_blocked
+
+
+def find_nearest_claims(state: CoordinatorState, parameters: CellParameters) -> list[tuple[int, float]]:
+    """Find for each vehicle the one with the nearest claim, and the least gap in all stages over its distance.
+
+    A vehicle alone, or without a claim, has itself and infinity.
+    """
+    gaps = find_gaps(state.claims, state.claims, parameters.distance_m).min(axis=2)
+    np.fill_diagonal(gaps, np.inf)
+    return [(i if np.isinf(row.min()) else int(row.argmin()), float(row.min())) for i, row in enumerate(gaps)]
 
 
 def _gather_boxes(cells: Sequence[MovingCell], step: int) -> Boxes:

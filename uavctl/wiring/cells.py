@@ -2,37 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from uavctl.arrays import SECOND_NS, Array
 from uavctl.config.checks import get_position_index, get_position_limits_m
+from uavctl.config.document import ConfigProblem
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError, DesignError
 from uavctl.fleet.cell import Report, format_cell, parse_report
-from uavctl.fleet.coordinator import CellParameters, CoordinatorState, advance, begin_without_cells, issue, receive
+from uavctl.fleet.coordinator import (
+    CellParameters,
+    CoordinatorState,
+    advance,
+    begin_without_cells,
+    find_near_starts,
+    issue,
+    receive,
+)
 from uavctl.flight.cells import CellRows
 from uavctl.flight.limits import AXES
-from uavctl.records import CellMessage, CellReport
+from uavctl.records import CellMessage, CellReport, Conduct
 from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.plant import Plant
 
 CYCLE_NS = SECOND_NS // 10  # time between two cycles of the coordinator
+NO_REPORTS: Mapping[int, CellReport] = {}
+SCHEME = "age-conditioned"  # the scheme whose programs take limits for each stage
 
 
 def build_cell_rows(config: Config, design: AnyDesign) -> CellRows:
     """Find the rows of the state set that limit the positions.
 
     Raises:
-        DesignError: The plant lacks an axis, a position lacks a limit, or the mission is a trajectory.
+        DesignError: The plant lacks an axis, a position lacks a limit, the mission is a trajectory, or a controller
+            plans that takes no limits that move.
     """
-    key, plant = "mission.cells", design.plant
-    if plant.axes != AXES:
-        raise DesignError(key, f"the plant has the axes {', '.join(plant.axes)}", f"give it {', '.join(AXES)}")
-    if config.mission.trajectory != type(config.mission.trajectory)():
-        raise DesignError(key, "a trajectory has no place to wait at", "fly waypoints, or without cells")
-    return find_cell_rows(plant, design.state_set.c)
+    key = "mission.cells"
+    for problem in find_cell_problems(config):
+        raise DesignError(key, problem.reason, problem.todo)
+    return find_cell_rows(design.plant, design.state_set.c)
 
 
 def find_cell_rows(plant: Plant, c: Array) -> CellRows:
@@ -46,6 +57,24 @@ def find_cell_rows(plant: Plant, c: Array) -> CellRows:
     return CellRows(upper, lower, np.abs(c[upper, index]), np.abs(c[lower, index]), index)
 
 
+def find_cell_problems(config: Config) -> Iterator[ConfigProblem]:
+    """Find what keeps a vehicle from flying in cells."""
+    axes, smpc, mission = config.plant.axes, config.smpc, config.mission
+    if tuple(axes) != AXES:
+        yield ConfigProblem("plant.axes", f"the plant has the axes {', '.join(axes)}", f"give it {', '.join(AXES)}")
+        return
+    open_axes = [axis for axis, sides in get_position_limits_m(config).items() if not np.isfinite(sides).all()]
+    if open_axes:
+        todo = "give sets.state_lower and sets.state_upper finite ones"
+        yield ConfigProblem("sets", f"the room has no limit {' and '.join(open_axes)}", todo)
+    if mission.trajectory != type(mission.trajectory)():
+        reason = "a trajectory has no place to wait at"
+        yield ConfigProblem("mission.trajectory", reason, "fly waypoints, or without cells")
+    if smpc.controller or smpc.scheme != SCHEME:
+        name = f'controller "{smpc.controller}"' if smpc.controller else f'scheme "{smpc.scheme}"'
+        yield ConfigProblem("smpc", f"{name} keeps no limits that move", f'take smpc.scheme = "{SCHEME}"')
+
+
 def _find_row(c: Array, state: int, sign: float) -> int:
     """Find the row that limits one state alone, upwards or downwards."""
     key = "mission.cells"
@@ -56,26 +85,35 @@ def _find_row(c: Array, state: int, sign: float) -> int:
     return int(rows[0])
 
 
+def find_fleet_problems(configs: Sequence[Config]) -> Iterator[ConfigProblem]:
+    """Find what keeps vehicles from sharing a room in cells."""
+    first, room = configs[0], get_position_limits_m(configs[0])
+    for number, config in enumerate(configs):
+        key = f"vehicle[{number}]"
+        for problem in find_cell_problems(config):
+            yield ConfigProblem(key, f"{problem.key}: {problem.reason}", problem.todo)
+        other_room = get_position_limits_m(config)
+        for name, value, shared in (
+            ("plant.dt_s", config.plant.dt_s, first.plant.dt_s),
+            ("smpc.horizon", config.smpc.horizon, first.smpc.horizon),
+            *((f"room ([sets]), {axis}", other_room.get(axis), room.get(axis)) for axis in AXES),
+        ):
+            if value != shared:
+                reason = f"{name} is {value}, and {shared} of the first vehicle"
+                yield ConfigProblem(key, reason, "give all vehicles the same; in cells they share it")
+
+
 def build_cell_parameters(configs: Sequence[Config], distance_m: float) -> CellParameters:
     """Build the constants of the coordinator of vehicles that share a room.
 
     Raises:
-        ConfigError: Their Δt, horizons or rooms differ.
+        ConfigError: They cannot fly in cells, or their Δt, horizons or rooms differ.
     """
+    problems = list(find_fleet_problems(configs))
+    if problems:
+        raise ConfigError(tuple(f"{problem.key}: {problem.reason}; {problem.todo}" for problem in problems))
     first = configs[0]
     rooms = [get_position_limits_m(config) for config in configs]
-    problems = [
-        f"vehicle[{number}]: {name} differs from that of the first vehicle; vehicles in cells share it"
-        for number, (config, room) in enumerate(zip(configs, rooms, strict=True))
-        for name, differs in (
-            ("plant.dt_s", config.plant.dt_s != first.plant.dt_s),
-            ("smpc.horizon", config.smpc.horizon != first.smpc.horizon),
-            ("[sets] of the positions", room != rooms[0]),
-        )
-        if differs
-    ]
-    if problems:
-        raise ConfigError(tuple(problems))
     lower_m, upper_m = np.array([rooms[0][axis] for axis in AXES]).T
     index = [get_position_index(first.plant)[AXES.index(axis)] + 1 for axis in AXES]
     speeds_mps = np.array([[config.sets.state_upper[i] for i in index] for config in configs])
@@ -101,33 +139,76 @@ class Coordinator:
 
     def __init__(self, parameters: CellParameters, vehicles: int) -> None:
         self._parameters, self._vehicles = parameters, vehicles
-        self._first: dict[int, Report] = {}  # reports before all vehicles have sent one
+        self._newest: dict[int, Report] = {}  # newest report of each vehicle that has sent one
+        self._received: dict[int, Report] = {}  # since the last cycle
         self._state: CoordinatorState | None = None
+        self._rests_m: dict[int, Array] | None = None  # places at which vehicles come to rest, see `hold`
+
+    def hold(self) -> None:
+        """Hold: from now on the goal of each vehicle is the place where its plan ends."""
+        self._rests_m = {} if self._rests_m is None else self._rests_m
+
+    @property
+    def parameters(self) -> CellParameters:
+        """Its constants."""
+        return self._parameters
+
+    @property
+    def has_all_reports(self) -> bool:
+        """Whether each vehicle has sent a report."""
+        return len(self._newest) == self._vehicles
+
+    def find_near_starts(self) -> list[tuple[int, int, float]]:
+        """Find the pairs that would begin too near to each other, and the distance to place them at [m]."""
+        return find_near_starts([self._newest[number] for number in range(self._vehicles)], self._parameters)
+
+    def is_at_rest(self, max_speed_mps: float) -> bool:
+        """Whether no vehicle that flies by plans is faster than a speed."""
+        flown = [report for report in self._newest.values() if report.conduct in (Conduct.CELL, Conduct.REST)]
+        return all(float(np.linalg.norm(report.velocity_mps)) <= max_speed_mps for report in flown)
+
+    def receive(self, number: int, message: CellReport) -> None:
+        """Receive the report of a vehicle for the next cycle.
+
+        Raises:
+            ValueError: It is malformed.
+        """
+        self._newest[number] = self._received[number] = self._read_report(number, message)
 
     @property
     def state(self) -> CoordinatorState | None:
         """State of the cells; None until all vehicles have reported."""
         return self._state
 
-    def update(self, at_ns: int, messages: Mapping[int, CellReport]) -> dict[int, CellMessage]:
+    def update(self, at_ns: int, messages: Mapping[int, CellReport] = NO_REPORTS) -> dict[int, CellMessage]:
         """Run a cycle; return the cell to send to each vehicle that has not decided about its newest one.
 
         Args:
             at_ns: Time of the common clock.
-            messages: Reports that came, by the number of the vehicle.
+            messages: Reports that came, by the number of the vehicle, beside those received before.
 
         Raises:
             ValueError: A report is malformed.
         """
-        reports = {number: parse_report(message) for number, message in messages.items()}
+        for number, message in messages.items():
+            self.receive(number, message)
+        reports, self._received = self._received, {}
         step = at_ns // round(self._parameters.dt_s * SECOND_NS)
         if self._state is None:
-            self._first |= reports
-            if len(self._first) < self._vehicles:
+            if not self.has_all_reports:
                 return {}
-            ordered = [self._first[number] for number in range(self._vehicles)]
+            ordered = [self._newest[number] for number in range(self._vehicles)]
             self._state = begin_without_cells(step, ordered, self._parameters)
         state = advance(self._state, max(step, self._state.step))
         self._state = state = issue(receive(state, reports), self._parameters)
         open_cells = zip(state.newest, state.is_decided, strict=True)
         return {number: format_cell(cell) for number, (cell, is_decided) in enumerate(open_cells) if not is_decided}
+
+    def _read_report(self, number: int, message: CellReport) -> Report:
+        """Read a report; to hold, its goal is the end of its plan."""
+        report = parse_report(message)
+        if len(report.plan.mean_m) != self._parameters.stages:
+            raise ValueError(f"a path has {len(report.plan.mean_m)} positions, not {self._parameters.stages}")
+        if self._rests_m is None:
+            return report
+        return replace(report, goal_m=self._rests_m.setdefault(number, report.plan.mean_m[-1]))
