@@ -178,7 +178,10 @@ def test_102_a_core_without_an_end_ends_control_with_a_landing_and_is_not_run_in
 
 
 @pytest.mark.fault(88)
-@pytest.mark.parametrize(("autopilot", "place"), [("px4", "receive"), ("ardupilot", "receive"), ("px4", "tick")])
+@pytest.mark.parametrize(
+    ("autopilot", "place"),
+    [("px4", "receive"), ("px4", "tick"), pytest.param("ardupilot", "receive", marks=pytest.mark.slow)],
+)
 def test_88_where_no_tick_works_any_more_landing_is_asked_for_until_it_is_answered(
     autopilot: str, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,6 +24,7 @@ def _as_before() -> Iterator[None]:
     yield
     assert os.sched_getscheduler(0) == before
     assert gc.isenabled() and gc.get_freeze_count() == 0
+    gc.freeze()  # as tests/conftest.py has it for the others of this process
 
 
 def outcomes(found: tuple[RealtimeSetting, ...]) -> dict[str, RealtimeSetting]:

@@ -223,7 +223,14 @@ def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str)
     assert any("envelope-" in alarm for alarm in flight.alarms)
 
 
-@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(3, 12))])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        0,
+        *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)),
+        *(pytest.param(seed, marks=pytest.mark.long) for seed in range(3, 12)),
+    ],
+)
 @pytest.mark.fault(44)
 def test_two_faults_at_a_time(prepared: Prepared, seed: int) -> None:
     assert_bounded(fly_pair(prepared, seed))

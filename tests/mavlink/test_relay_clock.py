@@ -20,7 +20,7 @@ from uavctl.records import Event, RelayStats, StepInput
 
 TIMESYNC = mavlink.MAVLINK_MSG_ID_TIMESYNC
 EXTERNAL = {"px4": "OFFBOARD", "ardupilot": "GUIDED"}
-FROM_S, TO_S = 12.0, 32.0
+FROM_S, TO_S = 12.0, 26.0
 SLOW_PPM = -14_000  # of PX4's own simulation, as recorded
 Flights = dict[str, tuple[Delay, float]]
 

@@ -12,7 +12,7 @@ from uavctl.config.document import Spans
 from uavctl.config.link import LinkConfig
 
 MS = 1_000_000
-N = 50_000
+N = 20_000
 
 
 def channel(seed: int = 3, start_ns: int = 0, **link: Any) -> Channel:

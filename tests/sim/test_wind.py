@@ -29,8 +29,8 @@ def blow(steps: int, seed: int = 1, mean: Vec3 = NORTH_WIND, step_s: float = STE
 
 @pytest.fixture(scope="module")
 def long() -> Array:
-    """Eleven hours of gusts, without the mean."""
-    return blow(400_000) - NORTH_WIND
+    """Five and a half hours of gusts, without the mean."""
+    return blow(200_000) - NORTH_WIND
 
 
 def test_the_figures_are_those_of_the_specification() -> None:

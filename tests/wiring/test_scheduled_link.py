@@ -11,7 +11,7 @@ from uavctl.errors import ConfigError, DesignError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.wiring.link import build_ages, build_delayed_link
 
-STEPS, MAX_AGE = 4000, 30
+STEPS, MAX_AGE = 2000, 30
 
 
 def make_config(*overrides: str) -> Config:
@@ -40,7 +40,7 @@ def test_ages_on_the_simulators_channel_keep_the_bound(wait_s: float, loss: floa
         ages.append(int((step * 50_000_000 - newest_ns) // 50_000_000))
     counted = np.array([np.mean(np.array(ages) >= n) for n in range(MAX_AGE)])
     bound = np.array([build_ages(config).outage(n) for n in range(MAX_AGE)])
-    assert np.all(counted <= bound + (0.03 if loss else 1.5 / STEPS))  # of 4,000 correlated steps
+    assert np.all(counted <= bound + (0.03 if loss else 1.5 / STEPS))  # of 2,000 correlated steps
     assert counted[1] >= 0.3 * bound[1]  # other ages than 0 occur as far as the bound allows
 
 

@@ -38,7 +38,7 @@ from uavctl.smpc.batch import BatchSmpc, Decisions
 from uavctl.smpc.hahn_stursberg.shortcut import ShortcutDecider, ShortcutSolver
 from uavctl.wiring.controller import build_design, build_plant, make_start_state
 
-RUNS, STEPS, SEED = 20, 50, 3
+RUNS, STEPS, SEED = 10, 50, 3
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_chunks_change_nothing(setup: Setup, result: VariantResult, monkeypatch:
     progress: list[int] = []
     (flights,) = fly_all([setup], RUNS, STEPS, SEED, 1, progress.append)
     repeated = assess(setup, PRINTED.note, flights, SEED)
-    assert progress == [7, 7, 6]
+    assert progress == [7, 3]
     assert flights.drawn.shape == (RUNS, STEPS + 1, 4)
     for name in ("decisions", "state_violations", "max_age", "age_distribution", "aged_share", "runs_outside"):
         assert getattr(repeated, name) == getattr(result, name)

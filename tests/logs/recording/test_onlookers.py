@@ -31,7 +31,7 @@ def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None
 
 
 def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path: Path) -> None:
-    items = fly_view().entries[:120]
+    items = fly_view().entries[:60]
     whole = tmp_path / "whole.mcap"
     recorder = SyncRecorder(whole, derived_topics=DerivedTopics(ViewBuilder()))
     for item in items:

@@ -160,7 +160,7 @@ def test_the_first_drop_is_noted_before_what_was_put_after_it(tmp_path: Path) ->
 
 @pytest.mark.fault(29)
 def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_records_nor_views(tmp_path: Path) -> None:
-    items = fly_view().entries[:120]
+    items = fly_view().entries[:60]
     views: list[bytes] = []
     number = 0
     while True:

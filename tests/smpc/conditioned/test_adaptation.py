@@ -81,7 +81,7 @@ def test_bounds_of_a_long_record_are_above_the_link_and_near_it(shares: Array, l
     first_loss = loss if burst == 1.0 else loss / (burst * (1.0 - loss))
     continuation = loss if burst == 1.0 else 1.0 - 1.0 / burst
     bounds = np.array(
-        [adaptation.bound_link(record_ages(draw_ages(1500, loss, burst, seed), shares).counts) for seed in range(60)]
+        [adaptation.bound_link(record_ages(draw_ages(1500, loss, burst, seed), shares).counts) for seed in range(30)]
     )
     for found, true in zip(bounds.T, (first_loss, continuation), strict=True):
         odds, true_odds = found / (1.0 - found), true / (1.0 - true)
