@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from uavctl.arrays import Array
@@ -134,6 +134,7 @@ def test_nobody_waits_longer_than_the_longest_wait(
         assert all(slot - at < max_wait_slots for at in last)
 
 
+@example(schedule="oldest-first", phases_ns=[0, 0, 0], slot_ns=9_790_664, max_rounds=1.0)
 @given(
     schedule=st.sampled_from(sorted(SCHEDULES)),
     phases_ns=st.lists(st.integers(0, 19_999_999), min_size=1, max_size=7),
