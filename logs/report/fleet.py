@@ -6,7 +6,7 @@ A recording that is missing or damaged is noted, and the rest is used.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import combinations
@@ -65,7 +65,7 @@ class FleetVehicle:
     track: Track  # empty without a position
     begin_ns: int
     end_ns: int
-    age_at_ns: Times  # (n,) ticks at which the controller flew, with a position
+    age_at_ns: Times  # (n,) ticks at which the controller flew; of a vehicle never flown, those before its end
     ages_s: Array  # (n,) age of the newest position
     horizon_s: float
     fallbacks_ns: tuple[tuple[int, int], ...]
@@ -242,8 +242,7 @@ def _make_vehicle(path: Path, flight: FlightData, entries: Entries) -> FleetVehi
         places = [(truth.at_ns, truth.position_m) for truth in flight.truths]
     else:
         places = [(one.at_ns, design.position_of(one.mean)) for one in select_trusted_estimates(flight)]
-    controlled = {one.at_ns for one in flight.decisions if one.mode not in _NOT_CONTROLLED}
-    ages = [(one.at_ns, one.age_s) for one in flight.estimates if one.at_ns in controlled]
+    ages = _select_ages(flight, _NOT_CONTROLLED) or _select_ages(flight, (ControlMode.STOPPED,))
     errors_m = compute_position_errors_m(flight)
     errors_m = errors_m[np.isfinite(errors_m)]
     name, breach = path.parent.name, flight.breach
@@ -267,6 +266,12 @@ def _make_vehicle(path: Path, flight: FlightData, entries: Entries) -> FleetVehi
         encounters=Encounters.of(entries, zero_ns),
         limits_m=(*_get_limits_m(design, "north"), *_get_limits_m(design, "east")),
     )
+
+
+def _select_ages(flight: FlightData, without: Collection[ControlMode]) -> list[tuple[int, float]]:
+    """Return times [ns] and ages [s] of the ticks that have a position and another mode."""
+    ticks_ns = {one.at_ns for one in flight.decisions if one.mode not in without}
+    return [(one.at_ns, one.age_s) for one in flight.estimates if one.at_ns in ticks_ns]
 
 
 def _make_track(name: str, places: Sequence[tuple[int, Sequence[float]]], zero_ns: int, *, is_true: bool) -> Track:
@@ -377,4 +382,10 @@ def _read_sender(path: Path, fleet: Fleet, notes: list[str]) -> SentPositions | 
         return None
     if sent.fault:
         notes.append(f"{SENDER} is shown up to {sent.fault}")
-    return replace(sent, at_ns=sent.at_ns[is_in_flight], vehicles=sent.vehicles[is_in_flight])
+    order = sorted(range(len(sent.names)), key=lambda number: _sort_key(sent.names[number]))
+    return replace(
+        sent,
+        names=tuple(sent.names[number] for number in order),
+        at_ns=sent.at_ns[is_in_flight],
+        vehicles=np.argsort(order)[sent.vehicles[is_in_flight]],
+    )

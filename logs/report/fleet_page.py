@@ -135,9 +135,12 @@ def _find_trouble(fleet: Fleet) -> Iterator[_Finding]:
         if vehicle.let_go is not None:
             at_ns, reason = vehicle.let_go
             yield _Finding(BAD, "Let go", f"{vehicle.name} at {seconds(fleet.to_seconds(at_ns))}: {reason}")
+    names_by_ending: dict[str, list[str]] = {}
     for vehicle in fleet.vehicles:
         if not vehicle.ending.as_ordered and vehicle.let_go is None:
-            yield _Finding(BAD, "Not as ordered", f"{vehicle.name}: {vehicle.ending.sentence.rstrip('.')}")
+            names_by_ending.setdefault(vehicle.ending.sentence.rstrip("."), []).append(vehicle.name)
+    for sentence, names in names_by_ending.items():
+        yield _Finding(BAD, "Not as ordered", f"{', '.join(names)}: {sentence}")
     for vehicle in fleet.vehicles:
         if vehicle.fallbacks_ns:
             begin_s = seconds(fleet.to_seconds(vehicle.fallbacks_ns[0][0]))
@@ -196,7 +199,7 @@ def _show_vehicles(fleet: Fleet) -> Iterator[Part]:
         "mean square [m²]",
     )
     if rows:
-        yield render_table(columns, rows, frozenset(range(2, len(columns))))
+        yield render_table(columns, rows, frozenset(range(2, len(columns))), kind="dense")
 
 
 def _link_page(vehicle: FleetVehicle) -> str:
@@ -311,7 +314,7 @@ SECTIONS: tuple[PageSection[Fleet], ...] = (
     PageSection(
         "Age of information",
         draw_ages,
-        note="The age of the newest position at each tick that the controller flew.",
+        note="The age of the newest position at each tick that the controller flew; where it never flew, at each tick.",
         legend=(
             Mark("line", "estimate", "age"),
             Mark("dashed", "limit", "a plan's end", when=lambda fleet: _reaches_horizon(fleet)),

@@ -17,6 +17,11 @@ import pytest
 
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
+from logs.recording.sender import SenderRecording
+from uavctl.clock import VIRTUAL_ZERO_UTC_NS
+from uavctl.config import load_config
+from uavctl.lab.lockstep import fly_fleet
+from uavctl.wiring.controller import build_flight_design, prepare
 
 LIMIT_S = 60.0
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -156,6 +161,25 @@ def comparison(page: Path) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two vehicles with long names that fly away from each other, and the messages to both."""
+    folder, names = tmp_path_factory.mktemp("fleet"), ("the-first-of-two-vehicles", "the-second-of-two-vehicles")
+    prepared = []
+    for number in (1, 2):
+        places = [f"sim.start_position_m=[0,{number - 1.5},-1]", f"target.position_m=[0,{3 * number - 4.5},-1]"]
+        config = load_config("room-px4", [*places, f"sim.system_id={number}", "duration_s=4"])
+        prepared.append(prepare(config, build_flight_design(config)))
+    flown = fly_fleet(prepared, folder)
+    for path, name in zip(flown.paths, names, strict=True):
+        path.parent.rename(folder / name)
+    with SenderRecording(folder / "sender.mcap", list(names), VIRTUAL_ZERO_UTC_NS) as recording:
+        for number in range(400):
+            recording.add(number * 10_000_000, number % 2, 0, 44, (0.0, 0.0))
+    uavctl("log", "report", str(folder), "--json")
+    return folder / "fleet.html"
+
+
 def faults(found: dict[str, Any]) -> list[object]:
     """What should be nothing: pixels beyond the edge, figures without height, texts on texts, texts beyond figures."""
     return [found["wide"] - found["seen"], found["flat"], found["clashes"], found["cut"]]
@@ -186,6 +210,16 @@ def test_a_comparison_is_whole_at_every_width(window: Browser, comparison: Path,
     assert "B is torn" in found["words"]
 
 
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_page_of_a_fleet_is_whole_at_every_width(window: Browser, fleet: Path, width: int) -> None:
+    found, console = window.open(fleet, width)
+    assert console == ""
+    assert faults(found) == NONE
+    assert found["hidden"] == []
+    assert found["figures"] == ["paths", "least-distance", "age-0", "age-1", "messages", "message-rates"]
+    assert "nan" not in found["words"].lower().split()
+
+
 def test_dark_pages_are_dark(window: Browser, page: Path) -> None:
     light, _ = window.open(page, 1000)
     dark, console = window.open(page, 1000, dark=True)
@@ -193,8 +227,8 @@ def test_dark_pages_are_dark(window: Browser, page: Path) -> None:
     assert (light["background"], dark["background"]) == ("rgb(243, 245, 247)", "rgb(18, 22, 27)")
 
 
-def test_paper_is_white_and_cuts_nothing(window: Browser, page: Path, comparison: Path) -> None:
-    for one in (page, comparison):
+def test_paper_is_white_and_cuts_nothing(window: Browser, page: Path, comparison: Path, fleet: Path) -> None:
+    for one in (page, comparison, fleet):
         found, _ = window.open(one, PAPER, dark=True, paper=True)
         assert found["background"] == "rgb(255, 255, 255)"
         assert faults(found) == NONE

@@ -143,6 +143,15 @@ def test_ages_are_those_of_a_sequence_made_by_hand(tmp_path: Path, capsys: pytes
     assert ages == pytest.approx([0.5, 0.99, 1.0], abs=1e-9)
 
 
+def test_ages_of_a_vehicle_that_was_never_flown_are_those_of_its_wait(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    modes = {99: ControlMode.STOPPED}
+    make_vehicle(tmp_path / "a", [*(0.1, 0.3, 0.8) * 33, 7.0], modes=lambda tick: modes.get(tick, ControlMode.WAIT))
+    (vehicle,) = report(tmp_path, capsys)["vehicles"]
+    assert [vehicle["mean_age_s"], vehicle["longest_age_s"]] == pytest.approx([0.4, 0.8], abs=1e-9)
+
+
 def test_two_clocks_are_brought_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Recordings of computers that started at other times; both vehicles rest 3 m apart."""
     make_vehicle(tmp_path / "a", [0.1] * 200)
@@ -185,7 +194,7 @@ MESSAGE_NS = 20_000_000
 
 def make_sender(path: Path, zero_utc_ns: int = UTC_NS) -> Path:
     """A sender's recording with the known order, from 5 s of the flight's clock on."""
-    names = ["a", "b", "c", "d"]
+    names = ["d", "b", "c", "a"]
     with SenderRecording(path, names, zero_utc_ns) as recording:
         for number, name in enumerate(ORDER):
             at_ns = 5_000_000_000 + MESSAGE_NS * number
