@@ -90,9 +90,10 @@ class FleetVehicle:
     @property
     def _sim(self) -> dict[str, Any]:
         try:
-            return dict(parse_recorded_config(self.header.config_toml).get("sim", {}))
+            table = parse_recorded_config(self.header.config_toml).get("sim")
         except ConfigError:
             return {}
+        return table if isinstance(table, dict) else {}  # a damaged header may have anything
 
 
 @dataclass(frozen=True, order=True)
@@ -332,9 +333,9 @@ def _read_world(path: Path, vehicles: Sequence[FleetVehicle], notes: list[str]) 
     for truth in truths:
         for one in truth.vehicles:
             places.setdefault(one.system_id, []).append((truth.at_ns, one.position_m))
+    tracks = {number: _make_track("", of_one, zero_ns, is_true=True) for number, of_one in places.items()}
     return _World(
-        {number: _make_track("", of_one, zero_ns, is_true=True) for number, of_one in places.items()},
-        Encounters.of(entries, zero_ns),
+        {number: track for number, track in tracks.items() if len(track.at_ns)}, Encounters.of(entries, zero_ns)
     )
 
 

@@ -110,7 +110,7 @@ def make_vehicle(
     estimate = next(item for item in items if isinstance(item, Estimate))
     decision = next(item for item in items if isinstance(item, Decision))
     mean = (north_m, *(0.0,) * (len(estimate.mean) - 1))
-    first = replace(header(scene, 'name = "made"\n', 0), zero_utc_ns=zero_utc_ns, started_utc=started_utc)
+    first = replace(header(scene, 'name = "made"\nsim = 3\n', 0), zero_utc_ns=zero_utc_ns, started_utc=started_utc)
     entries: list[Entry] = [("/uavctl/header", 0, first)]
     for tick, age_s in enumerate(ages_s):
         at_ns = 5_000_000_000 + TICK_NS * tick
