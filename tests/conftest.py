@@ -85,17 +85,18 @@ def _no_waiting_for_the_disk() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _flights_share_what_they_need() -> Iterator[None]:
-    """Flights of equal configurations share a design and its solver.
+    """Flights of equal configurations share these, a design and its solver.
 
     And no flight collects garbage among all that the tests' process holds: test_realtime.py does.
     """
-    from shared_designs import share_designs
+    from shared_designs import share_configurations, share_designs
 
     @contextmanager
     def leave_garbage() -> Iterator[Any]:
         yield SimpleNamespace(after_tick=lambda ticked, lateness_ns: None)
 
     with pytest.MonkeyPatch.context() as patch:
+        share_configurations(patch)
         share_designs(patch)
         for command in ("services", "loopback"):
             patch.setattr(f"uavctl.cli.{command}.control_garbage_collection", leave_garbage)

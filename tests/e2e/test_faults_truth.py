@@ -213,7 +213,7 @@ def test_positions_that_scatter(prepared: Prepared, leaning_world: Config, noise
     assert "LAND" in flight.ended
 
 
-@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("autopilot", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 @pytest.mark.fault(41)
 def test_wind_beyond_what_it_can_fly_against(prepared: Prepared, autopilot: str) -> None:
     config = load_config("room-hahn-stursberg", ["sim.plant=quadrotor", f"sim.autopilot={autopilot}", "sim.seed=3"])

@@ -36,7 +36,7 @@ def get_value(index: int, count: int) -> ParamValue:
     return ParamValue(system=1, component=1, name=f"P{index}", cast=0.0, bytewise=0.0, index=index, count=count)
 
 
-@BOTH
+@pytest.mark.parametrize("autopilot", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 def test_a_lossy_link_loses_none(autopilot: str) -> None:
     flight, dice = TakeOffRig(autopilot), random.Random(4)
     flight.hears = lambda data: not list_requests(data) or dice.random() > 0.3

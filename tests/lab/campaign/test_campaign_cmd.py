@@ -14,7 +14,6 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from campaign_rig import HEAD, controller, table
-from distributed import LocalCluster
 
 from uavctl.cli import campaign_run
 from uavctl.cli.app import run
@@ -70,6 +69,8 @@ def flown(spec: Path) -> Path:
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
     """Address of a real scheduler with two real worker processes."""
+    from distributed import LocalCluster  # a quarter of a second, in each process that collects this file
+
     with LocalCluster(  # type: ignore[no-untyped-call]
         n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
     ) as cluster:

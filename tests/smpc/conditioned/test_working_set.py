@@ -18,7 +18,7 @@ def requested(name: str) -> list[Answer]:
     return [solver.solve(seq, *question) for seq, question in enumerate(draw_questions(solver, 60, 4))]
 
 
-@pytest.mark.parametrize("name", ["room-px4", "room-ardupilot"])
+@pytest.mark.parametrize("name", ["room-px4", pytest.param("room-ardupilot", marks=pytest.mark.slow)])
 def test_a_guess_saves_iterations_and_changes_no_plan(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     guessed = requested(name)
     monkeypatch.setattr(WorkingSetGuess, "is_suitable", lambda *_: False)
