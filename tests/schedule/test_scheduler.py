@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from uavctl.arrays import Array
@@ -134,7 +134,6 @@ def test_nobody_waits_longer_than_the_longest_wait(
         assert all(slot - at < max_wait_slots for at in last)
 
 
-@example(schedule="oldest-first", phases_ns=[0, 0, 0], slot_ns=9_790_664, max_rounds=1.0)
 @given(
     schedule=st.sampled_from(sorted(SCHEDULES)),
     phases_ns=st.lists(st.integers(0, 19_999_999), min_size=1, max_size=7),
@@ -149,12 +148,13 @@ def test_with_cameras_of_50_hz_the_wait_is_that_of_the_link_model(
         messages_per_s=1e9 / slot_ns, rate_hz=50.0, schedule=schedule, max_wait_s=max_rounds * count * slot_ns * 1e-9
     )
     max_wait_slots, wait_s = compute_max_wait_slots(radio, count), compute_link_wait_s(radio, count)
+    assume(max_wait_slots >= count)  # else the longest wait is refused: it has no time for answers to TIMESYNC
     winds = [(0.05, 0.2, 3.0)[number % 3] for number in range(count)]
     scheduler = Scheduler(
         schedule,
         np.array([compute_message_values(make_costs(wind), 0.3) for wind in winds]),
         slot_ns=slot_ns,
-        max_wait_slots=max(count, max_wait_slots),
+        max_wait_slots=max_wait_slots,
         loss=0.3,
         feedback_delay_ns=0,
         start_ns=0,
