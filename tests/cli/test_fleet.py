@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from msgspec.structs import replace
 from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, end_process, reserve_port
 from patience import wait_until
@@ -278,19 +279,34 @@ def test_positions_in_two_boxes_are_as_far_apart_as_the_reported_gap(
 
 @contextmanager
 def fly_fleet(
-    *options: str, environ: Mapping[str, str] | None = None
+    head: str = HEAD,
+    starts_m: tuple[float, float] | None = None,
+    *settings: str,
+    options: Sequence[str] = (),
+    environ: Mapping[str, str] | None = None,
 ) -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[str]]]:
-    """Two simulated vehicles in the air, flown by `uavctl fleet fly`; with their true places."""
+    """Two simulated vehicles in the air, flown by `uavctl fleet fly`; with their true places.
+
+    Args:
+        starts_m: where they start, east, in one room for both; None: each starts in the middle of its own box.
+        settings: of both.
+        options: of the command.
+        environ: its environment; None: without pages.
+    """
     truths: dict[str, list[Truth]] = {"west": [], "east": []}
     done, seats, tables = threading.Event(), [], []
-    for number, (name, limits) in enumerate({"west": WEST, "east": EAST}.items()):
+    for number, (name, box) in enumerate({"west": WEST, "east": EAST}.items()):
+        limits = box if starts_m is None else ROOM
+        start_m = sum(limits) / 2 if starts_m is None else starts_m[number]
+        goal = () if starts_m is None else (f"target.position_m=[0,{starts_m[1 - number]},-1]",)
         with reserve_port() as first, reserve_port() as second:
             ports = int(first.getsockname()[1]), int(second.getsockname()[1])
         vehicle, mocap = (f"127.0.0.1:{number}" for number in ports)
-        start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
+        start = f"sim.start_position_m=[0,{start_m},-1]"
         config = load_config("room-px4", [PATIENT_VEHICLE, start, f"sim.system_id={number + 1}"])
         seats.append(VehicleSetup(config, f"udpout://{vehicle}", f"udpout://{mocap}", truths[name].append))
-        tables.append(make_entry(name, limits, f"udpin://{vehicle}", f"udpin://{mocap}", *PATIENT_DAEMON))
+        more = (*PATIENT_DAEMON, *goal, *settings)
+        tables.append(make_entry(name, limits, f"udpin://{vehicle}", f"udpin://{mocap}", *more))
     peers = threading.Thread(
         target=serve_all,
         args=(seats,),
@@ -298,7 +314,7 @@ def fly_fleet(
     )
     with tempfile.TemporaryDirectory(prefix="uavctl-") as folder:
         path = Path(folder) / "fleet.toml"
-        path.write_text(HEAD + "".join(tables))
+        path.write_text(head + "".join(tables))
         command = [sys.executable, "-m", "uavctl", "fleet", "fly", str(path), "--out", str(Path(folder) / "out")]
         try:
             own_environ = {**(environ or without_pages()), FOLDER_VARIABLE: str(Path(folder) / "c")}
@@ -374,7 +390,7 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
 @pytest.mark.slow
 def test_both_are_on_the_live_page_where_they_are_and_on_the_page_of_the_end() -> None:
     (port,) = choose_ports(1)
-    with fly_fleet("--live", "--live-port", str(port), environ=os.environ) as (path, truths, fleet):
+    with fly_fleet(options=("--live", "--live-port", str(port)), environ=os.environ) as (path, truths, fleet):
         reader = SceneReader(port)
 
         def are_shown() -> bool:
@@ -396,6 +412,33 @@ def test_both_are_on_the_live_page_where_they_are_and_on_the_page_of_the_end() -
     true_m = min(math.dist(*pair) for pair in places)
     (approach,) = flown.approaches
     assert approach.distance_m == pytest.approx(true_m, abs=0.2) and not approach.is_true
+
+
+@pytest.mark.slow
+@pytest.mark.fault(70)
+def test_two_vehicles_in_cells_exchange_their_places_and_then_land() -> None:
+    places_m, slower = (-1.0, 1.0), ("limits.accel_mps2=[2,2,1.5]", "sets.input_lower=[-2,-2,-1.5]")
+    settings = (*slower, "sets.input_upper=[2,2,1.5]")
+    with fly_fleet(CELLS, places_m, *settings) as (path, truths, fleet):
+
+        def have_arrived() -> bool:
+            goals = zip(truths.values(), reversed(places_m), strict=True)
+            return all(math.dist(track[-1].position_m, (0.0, east_m, -1.0)) < 0.3 for track, east_m in goals)
+
+        wait_until(have_arrived, "both are at each other's place")
+        fleet.send_signal(signal.SIGINT)
+        for name, track in truths.items():
+            wait_until(lambda track=track: any(truth.mode == "AUTO.LAND" for truth in track), f"{name} lands")  # type: ignore[misc]
+        wait_until(lambda: fleet.poll() is not None, "the end")
+        with (path.parent / "out" / "coordinator.mcap").open("rb") as file:
+            cycles = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages()]
+    east = {truth.at_ns: truth.position_m for truth in truths["east"]}
+    pairs = [(truth.position_m, east[truth.at_ns]) for truth in truths["west"] if truth.at_ns in east]
+    # The radii of the simulated vehicles are 0.07 m
+    assert min(math.dist(west_m, east_m) for west_m, east_m in pairs) > 0.14
+    assert any(math.dist(west_m, east_m) < 1.9 for west_m, east_m in pairs)
+    issued = [cycle for cycle in cycles if not any(vehicle["wait"] for vehicle in cycle["vehicles"].values())]
+    assert issued and all(vehicle["gap"] >= 1.0 - 1e-4 for cycle in issued for vehicle in cycle["vehicles"].values())
 
 
 def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(

@@ -172,9 +172,10 @@ def test_a_page_s_configurations_load(page: str) -> None:
 
 
 def test_the_page_of_fleets_shows_its_examples() -> None:
-    fleet, radio = find_blocks("docs/fleet.md", "toml")
+    fleet, radio, cross = find_blocks("docs/fleet.md", "toml")
     assert fleet == (ROOT / "docs/examples/duo.toml").read_text(encoding="utf-8")
     assert radio in (ROOT / "docs/examples/radio.toml").read_text(encoding="utf-8")
+    assert cross in (ROOT / "docs/examples/cross.toml").read_text(encoding="utf-8")
 
 
 FIRST = "docs/first-flight.md"
@@ -229,7 +230,7 @@ def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShel
 def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
     page = "docs/fleet.md"
     sim, four = find_commands(page, "Try it")
-    others = (sim, four, *find_commands(page, "One radio"))
+    others = (sim, four, *find_commands(page, "One radio"), *find_commands(page, "One room"))
     check, fly, *orders = (order for order in find_commands(page) if order not in others)
     shell.run(check)
     duo = shell.folder / "duo.toml"

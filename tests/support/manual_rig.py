@@ -143,7 +143,7 @@ def open_shell(folder: Path) -> Iterator[ManualShell]:
     """Open a shell in a folder with the parts of a checkout; end running commands at the end."""
     for name in ("uavctl", "docs", "tools", "sim", "logs"):
         (folder / name).symlink_to(ROOT / name)
-    for example in ("duo.toml", "radio.toml"):
+    for example in ("duo.toml", "radio.toml", "cross.toml"):
         (folder / example).write_bytes((ROOT / "docs/examples" / example).read_bytes())
     with tempfile.TemporaryDirectory(prefix="uavctl-") as short, _network() as network:  # sockets want short names
         (Path(short) / "bin").mkdir()

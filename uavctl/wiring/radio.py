@@ -93,9 +93,7 @@ def compute_slots_s(radio: RadioConfig, count: int, slots: int) -> float:
 def compute_max_wait_slots(radio: RadioConfig, count: int) -> int:
     """Return the longest wait of a vehicle, in slots; too few for all of them if `max_wait_s` is too short."""
     if radio.max_wait_s is not None:
-        slots = (
-            int(radio.max_wait_s * SECOND_NS / compute_slot_ns(radio)) + 1
-        )  # one more: a whole number may be rounded
+        slots = int(radio.max_wait_s * SECOND_NS / compute_slot_ns(radio))
         while slots and compute_slots_s(radio, count, slots) > radio.max_wait_s + 1e-9:
             slots -= 1
         return slots
