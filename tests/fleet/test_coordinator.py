@@ -160,6 +160,29 @@ def test_cells_keep_away_from_a_released_vehicle_or_their_vehicle_is_told_to_lan
     assert all(cell.land for cell in state.newest[:4])
 
 
+def test_the_place_to_land_at_stays_and_is_reached() -> None:
+    """A place beside the newest position moved on with the vehicle, along the floor to the next wall."""
+    released = Report(
+        PlannedPath(0, np.tile(STARTS_M[4], (STAGES, 1)), np.zeros((STAGES, 3))), np.zeros(3), 0, 0, Conduct.FREE
+    )
+    state = receive(begin(0, STARTS_M, GOALS_M, PARAMETERS), {4: released})
+    state = issue(advance(state, 20), PARAMETERS)
+    places_m = [cell.goal_m for cell in state.newest[:4]]
+    assert all(cell.land for cell in state.newest[:4])
+    for place_m in places_m:
+        assert (np.abs(place_m[:2]) <= 2.5 + 1e-9).all()  # the room's walls are at 3 m
+    for step in range(21, 80):
+        reports = {}
+        for i, cell in enumerate(state.newest[:4]):
+            plan = PlannedPath(step - 1, np.clip(cell.goal_m, cell.lower_m, cell.upper_m), np.zeros((STAGES, 3)))
+            plan = plan.advance(step)
+            reports[i] = Report(plan, np.zeros(3), cell.number, cell.number)
+        state = issue(receive(advance(state, step), reports), PARAMETERS)
+    for i, place_m in enumerate(places_m):
+        assert state.newest[i].land and (state.newest[i].goal_m == place_m).all()
+        assert state.reports[i].plan.mean_m[0, :2] == pytest.approx(place_m[:2], abs=0.02)
+
+
 def test_a_cell_that_is_taken_before_a_refused_cell_to_land_in_is_the_claim() -> None:
     state = begin(0, STARTS_M, GOALS_M, PARAMETERS)
     state = issue(state, PARAMETERS)

@@ -32,6 +32,7 @@ from uavctl.records import Conduct
 
 START_NUMBER = 0  # number of the cell in which a vehicle begins
 LANDING_WAY_M = 1.2  # way to the side on which a vehicle lands beside an obstacle's way
+LANDING_WALL_M = 0.5  # from the walls to a place to land at: plans keep their margins from walls, and get no nearer
 GRID_M = 1e-4  # sides of cells are multiples of it: short as text, and far below all margins
 GRID_TOLERANCE = 1e-6  # part of it that is rounding
 MIN_SPEED_MPS, MIN_WAY_M = 0.1, 0.01  # an obstacle that is slower stands; a vehicle that is nearer has no side
@@ -232,7 +233,13 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
         state.goals_m,
         Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m),
     )
-    landing_places_m = _find_landing_places(state, is_growing | is_blocked, positions_m, parameters)
+    is_told = np.array([cell.land for cell in state.newest], dtype=bool)
+    # The place stays once it is told: one beside the newest position would lead the vehicle along the floor for good
+    landing_places_m = np.where(
+        is_told[:, None],
+        [cell.goal_m for cell in state.newest],
+        _find_landing_places(state, is_growing | is_blocked, positions_m, parameters),
+    )
     guides_m = np.where(must_land[:, None], landing_places_m, guides_m)
     wanted = _extend(plans, guides_m, room_m, parameters)
     lower_m = np.maximum(wanted.lower_m, bounds.lower_m)
@@ -244,7 +251,6 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
         np.ceil(lower_m / GRID_M - GRID_TOLERANCE) * GRID_M, np.floor(upper_m / GRID_M + GRID_TOLERANCE) * GRID_M
     )
     # A vehicle that must land has its first such cell at once
-    is_told = np.array([cell.land for cell in state.newest], dtype=bool)
     takes_cells = np.array([report.conduct in (Conduct.CELL, Conduct.REST) for report in state.reports], dtype=bool)
     reasons = {
         Wait.SILENT: is_silent,
@@ -393,6 +399,6 @@ def _find_landing_places(
         beside_m = offsets_m - np.clip(ahead_s, 0.0, None)[:, None] * way_mps
         length_m = np.linalg.norm(beside_m, axis=1, keepdims=True)
         places_m[:, :2] += LANDING_WAY_M * beside_m / np.maximum(length_m, MIN_WAY_M)
-    places_m = np.clip(places_m, parameters.room_lower_m, parameters.room_upper_m)
+    places_m = np.clip(places_m, parameters.room_lower_m + LANDING_WALL_M, parameters.room_upper_m - LANDING_WALL_M)
     places_m[:, 2] = parameters.room_upper_m[2]
     return places_m
