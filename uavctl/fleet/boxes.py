@@ -89,17 +89,16 @@ def divide_pairs(claims: Boxes, plans: Boxes, distance_m: float) -> Bounds:
     is_pair = present[first] & present[second]
     first, second = first[is_pair], second[is_pair]
     middle, half = 0.5 * (plans.lower_m + plans.upper_m), 0.5 * (plans.upper_m - plans.lower_m)
-    # ρ = ±(m_j - m_i) / (w_i + w_j + d), + where i is below j; entries (pair, stage, 3 axes i below j, then 3 above)
+    # ρ = ±(m_j - m_i) / (w_i + w_j + d), + where the claim of i is below that of j: at most one sign is possible
     ratio = (middle[second] - middle[first]) / (half[first] + half[second] + needed)
-    ratio = np.concatenate([ratio, -ratio], axis=2)
-    gap_m = np.concatenate(
-        [claims.lower_m[second] - claims.upper_m[first], claims.lower_m[first] - claims.upper_m[second]], axis=2
-    )
-    ratio[gap_m < np.tile(needed, 2) - ROUNDING_M] = -np.inf
+    is_below = claims.lower_m[second] - claims.upper_m[first] >= needed - ROUNDING_M
+    is_above = claims.lower_m[first] - claims.upper_m[second] >= needed - ROUNDING_M
+    ratio = np.where(is_below, ratio, np.where(is_above, -ratio, -np.inf))
     choice = ratio.argmax(axis=2)
-    is_apart = np.isfinite(ratio.max(axis=2, initial=-np.inf))
+    is_apart = np.isfinite(np.take_along_axis(ratio, choice[..., None], axis=2)[..., 0])
     pair, stage = np.nonzero(is_apart)
-    axis, is_above = choice[pair, stage] % 3, choice[pair, stage] >= 3
+    axis = choice[pair, stage]
+    is_above = is_above[pair, stage, axis]
     low, high = np.where(is_above, second[pair], first[pair]), np.where(is_above, first[pair], second[pair])
     low_at, high_at = (low, stage, axis), (high, stage, axis)
     # c = (p_low + p_high) / 2, at least d / 2 outside of both claims
