@@ -4,6 +4,7 @@ It prints, for each number of vehicles, the figures of all seeds from the true p
 the closest pair, and the time to finish over that of a straight line. `--cycle` measures a cycle of the coordinator.
 
     python tools/swaps.py --vehicles 2 4 8 12 --seeds 20 [--first 1000] [--autopilot ardupilot] [--method voronoi]
+        [--radio 5760]
     python tools/swaps.py --vehicles 20 --cycle
 """
 
@@ -97,6 +98,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--autopilot", choices=("px4", "ardupilot"), default="px4")
     parser.add_argument("--plant", choices=("linear", "quadrotor"), default="quadrotor")
     parser.add_argument("--method", choices=("cells", "voronoi"), default="cells")
+    parser.add_argument("--radio", type=float, metavar="BYTES_PER_S", help="one radio for the positions of all")
     parser.add_argument("--set", action="append", default=[], help="override of all vehicles")
     parser.add_argument("--out", type=Path, help="folder for the recordings, which are not kept without it")
     parser.add_argument("--cycle", action="store_true", help="measure a cycle of the coordinator only")
@@ -112,7 +114,7 @@ def main(arguments: list[str]) -> int:
         for seed in range(options.first, options.first + options.seeds):
             case = SwapCase(
                 vehicles, seed, options.autopilot, options.plant, options.loss, options.method,
-                overrides=tuple(options.set),
+                overrides=tuple(options.set), radio_bytes_per_s=options.radio,
             )  # fmt: skip
             folder = None if options.out is None else options.out / f"swap-{vehicles}-{seed}"
             results.append(fly_swap(case, folder))

@@ -26,10 +26,11 @@ from uavctl.fleet.cell import Report, format_cell, parse_report
 from uavctl.fleet.coordinator import CellParameters
 from uavctl.fleet.right_of_way import Ways, choose_guides
 from uavctl.fleet.voronoi import make_voronoi_cells
-from uavctl.lab.lockstep import LockstepFleet
+from uavctl.lab.lockstep import LockstepFleet, RecordedSender
 from uavctl.records import CellMessage, CellReport
 from uavctl.wiring.cells import CYCLE_NS, Coordinator, build_cell_parameters
 from uavctl.wiring.controller import build_flight_design, prepare
+from uavctl.wiring.radio import RadioConfig, make_link_overrides
 
 Method = Literal["cells", "voronoi"]
 Message = TypeVar("Message")
@@ -37,6 +38,7 @@ Message = TypeVar("Message")
 RADIUS_M, HEIGHT_M = 2.4, 1.2
 NEAR_M = 0.25  # distance from the goal at which a vehicle has arrived: its hold, and a side that another one needs
 STAY_S = 1.0  # time for which all vehicles stay there at the end
+RADIO_RATE_HZ = 50.0  # positions of each vehicle a second that the cameras give to a radio
 MAX_DELAY_NS = 2 * CYCLE_NS  # largest delay of a message
 # A room of 6 x 6 x 3 m
 _SETS = {
@@ -67,6 +69,7 @@ class SwapCase:
     cells_end_s: float = math.inf  # when the coordinator stops
     overrides: tuple[str, ...] = ()  # of all vehicles
     faults: tuple[tuple[int, str], ...] = ()  # override of one vehicle, by its number
+    radio_bytes_per_s: float | None = None  # budget of one radio for the positions of all; None: a link for each
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,13 @@ class Swap:
     def __init__(self, case: SwapCase, begins_m: Array, goals_m: Array, folder: Path) -> None:
         self.case, self.begins_m, self.goals_m = case, begins_m, goals_m
         seeds = np.random.default_rng(case.seed).integers(2**31, size=case.vehicles)
+        radio: RadioConfig | None = None
+        link: list[str] = []
+        if case.radio_bytes_per_s is not None:
+            radio = RadioConfig(
+                bytes_per_s=case.radio_bytes_per_s, rate_hz=RADIO_RATE_HZ, schedule="round-robin", loss=case.loss
+            )
+            link = [*make_link_overrides(radio, case.vehicles), f"sim.camera.rate_hz={RADIO_RATE_HZ}"]
         configs = [
             load_config(
                 f"room-{case.autopilot}",
@@ -195,6 +205,7 @@ class Swap:
                     "mission.cells=true",
                     f"sim.plant={case.plant}",
                     f"link.loss={case.loss}",
+                    *link,
                     f"duration_s={case.limit_s}",
                     f"sim.system_id={number + 1}",
                     f"sim.seed={seed}",
@@ -210,7 +221,10 @@ class Swap:
         self.parameters = build_cell_parameters(configs, case.distance_m)
         paths = [folder / f"vehicle-{number + 1}" / "flight.mcap" for number in range(case.vehicles)]
         prepared = [prepare(config, design) for config in configs]
-        self.fleet = LockstepFleet(prepared, paths, folder / "world.mcap")
+        self._sender = (
+            None if radio is None else RecordedSender(prepared, radio, case.distance_m, folder / "sender.mcap")
+        )
+        self.fleet = LockstepFleet(prepared, paths, folder / "world.mcap", sender=self._sender)
         self.traffic = CellTraffic(case, self.fleet, self.parameters)
         self._dt_ns = round(self.parameters.dt_s * SECOND_NS)
         self.closest = np.full(math.comb(case.vehicles, 2), np.inf)
@@ -236,6 +250,8 @@ class Swap:
             return watch(flown_s) and flown_s - self.away_s.max() < STAY_S
 
         with ExitStack() as stack:
+            if self._sender is not None:
+                stack.callback(self._sender.close)
             stack.callback(self.fleet.close)
             self.fleet.fly(continue_after)
         return self._summarize()
