@@ -91,3 +91,10 @@ def test_a_vehicle_at_its_goal_gives_way_to_one_that_cannot_pass() -> None:
     positions_m = np.array([[-2.5, 0.0, -1.0], [-1.5, 0.0, -1.0]])
     guides_m = choose_guides(positions_m, np.array([[2.0, 0.0, -1.0], [-1.5, 0.0, -1.0]]), walls)
     np.testing.assert_allclose(guides_m, [[-2.5, 0.0, -1.0], [-1.5 + PASS_M, 0.0, -1.0]], atol=1e-12)
+
+
+def test_a_vehicle_at_its_goal_gives_way_to_one_that_could_only_go_back() -> None:
+    walls = Ways(0.5, 0.06, np.array([-3.0, -0.5, -3.0]), np.array([3.0, 0.5, 0.0]))
+    positions_m = np.array([[-0.5, 0.0, -1.0], [0.5, 0.0, -1.0]])
+    guides_m = choose_guides(positions_m, np.array([[2.0, 0.0, -1.0], [0.5, 0.0, -1.0]]), walls)
+    np.testing.assert_allclose(guides_m, [[-0.5, 0.0, -1.0], [0.5 + PASS_M, 0.0, -1.0]], atol=1e-12)

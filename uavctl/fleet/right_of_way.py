@@ -4,6 +4,8 @@
 2. Where another vehicle blocks it, the vehicle passes on the right. Two vehicles face to face then pass each other.
 3. Where the right is blocked as well, the vehicle with the smaller number waits. The other one gives way: to the left,
    else back.
+4. A vehicle at its goal, or on its way back there, gives way to one that can pass on neither side. Else that one goes
+   back and ahead for good.
 """
 
 from __future__ import annotations
@@ -79,8 +81,10 @@ def choose_guides(positions_m: Array, goals_m: Array, ways: Ways) -> Array:
     asked: dict[int, int] = {}  # vehicle that waits for a vehicle at its goal
     for i in np.flatnonzero(is_blocking.any(axis=1) & (length_m > ARRIVED_M)).tolist():
         blocker = int(blockers[i])
-        move = choose_move(_describe_free(is_free[i]), i < blocker and bool(length_m[blocker] > ARRIVED_M))
-        if move is Move.WAIT and length_m[blocker] < PASS_M:
+        is_resting, directions = bool(length_m[blocker] < PASS_M), _describe_free(is_free[i])
+        directions[Move.BACK] &= not is_resting
+        move = choose_move(directions, i < blocker and bool(length_m[blocker] > ARRIVED_M))
+        if move is Move.WAIT and is_resting:
             asked.setdefault(blocker, i)
         guides_m[i, LEVEL] = positions_m[i, LEVEL] + _find_step_m(move, ahead[i])
     for i, waiting in asked.items():
