@@ -1,12 +1,19 @@
-"""Recording of a sender: one MCAP file with a JSON message for each position sent; its writer and its reader."""
+"""Recording of a sender: one MCAP file with a JSON message for each position sent; its writer and its reader.
+
+A thread of its own writes, so that a disk that hangs delays no position.
+"""
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from queue import Full, Queue
 from types import TracebackType
 from typing import BinaryIO, Self
 
@@ -35,6 +42,10 @@ _SCHEMA = {
     },
 }
 CHUNK_BYTES = 65_536  # a killed process loses the messages of the last chunk, a few seconds
+MAX_WAITING = 10_000  # messages that wait for the disk: more than a minute on a radio of 57,600 baud
+CLOSE_S = 5.0  # for the messages that wait at the end
+_HANGS = "the disk hangs"
+_Item = tuple[int, int, int, int, tuple[float, ...]]
 
 
 class SenderRecording:
@@ -63,6 +74,9 @@ class SenderRecording:
         self._writer.start(profile="", library="uavctl")
         schema = self._writer.register_schema("uavctl.SentPosition", "jsonschema", json.dumps(_SCHEMA).encode())
         self._channel = self._writer.register_channel(TOPIC, "json", schema)
+        self._waiting: Queue[_Item | None] = Queue(MAX_WAITING)  # None is the end
+        self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
+        self._thread.start()
 
     def __enter__(self) -> Self:
         return self
@@ -70,17 +84,38 @@ class SenderRecording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        try:
-            if not self.failure:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
-        except OSError as write_error:
-            self.failure = write_error.strerror or "write error"
+        with suppress(Full):
+            self._waiting.put(None, timeout=CLOSE_S)
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            self.failure = self.failure or _HANGS
 
     def add(self, at_ns: int, vehicle: int, captured_ns: int, length: int, ages_s: tuple[float, ...]) -> None:
         """Add a position that was sent at `at_ns`, monotonic time; a write error ends the recording alone."""
+        try:
+            self._waiting.put_nowait((at_ns, vehicle, captured_ns, length, ages_s))
+        except Full:
+            self.failure = self.failure or _HANGS
+
+    def _write(self) -> None:
+        """Write what comes, up to the end; nothing more after a failure."""
+        while (item := self._waiting.get()) is not None:
+            self._attempt(partial(self._write_message, *item))
+        self._attempt(self._writer.finish)
+        with suppress(OSError):
+            self._file.close()
+
+    def _attempt(self, write: Callable[[], object]) -> None:
         if self.failure:
             return
+        try:
+            write()
+        except OSError as error:
+            self.failure = error.strerror or "write error"
+
+    def _write_message(
+        self, at_ns: int, vehicle: int, captured_ns: int, length: int, ages_s: tuple[float, ...]
+    ) -> None:
         message = {
             "vehicle": self._names[vehicle],
             "captured_ns": captured_ns,
@@ -88,10 +123,7 @@ class SenderRecording:
             "ages_s": dict(zip(self._names, ages_s, strict=True)),
         }
         time_ns = self._zero_utc_ns + at_ns
-        try:
-            self._writer.add_message(self._channel, time_ns, json.dumps(message).encode(), time_ns)
-        except OSError as error:
-            self.failure = error.strerror or "write error"
+        self._writer.add_message(self._channel, time_ns, json.dumps(message).encode(), time_ns)
 
 
 class _SentPosition(msgspec.Struct, frozen=True):

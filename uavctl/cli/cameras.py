@@ -32,6 +32,7 @@ from uavctl.mavlink.connection import MOCAP
 from uavctl.wiring.sender import PositionSender, SentPosition
 
 SENT_MESSAGE = "VISION_POSITION_ESTIMATE"
+REPORT_NS = 200_000_000  # between two looks at what people should know
 MAX_SLEEP_NS = 50_000_000  # so that a signal ends the command soon
 
 
@@ -103,6 +104,7 @@ class _Run:
         self._connections |= {f"to {number}": target for number, target in enumerate(targets)}
         self._told: set[str] = set()
         self._silent: set[int] = set()
+        self._reported_ns = 0
 
     def run_once(self) -> None:
         """Send what is due, then wait for data or for the channel."""
@@ -128,7 +130,11 @@ class _Run:
 
     def report(self) -> None:
         """Tell people of vehicles without positions, closed connections, ended processes and a full disk, once each."""
-        silent, members = self._sender.find_silent(monotonic_ns()), self._fleet.members
+        at_ns, members = monotonic_ns(), self._fleet.members
+        if at_ns - self._reported_ns < REPORT_NS:
+            return
+        self._reported_ns = at_ns
+        silent = self._sender.find_silent(at_ns)
         for number in silent - self._silent:
             print_message(f"{members[number].name}: no position for 1 s from {members[number].cameras}")
         for number in self._silent - silent:
