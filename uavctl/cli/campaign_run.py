@@ -22,6 +22,16 @@ from uavctl.cli.common import Common, make_progress
 from uavctl.cli.output import make_table, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.errors import UsageError
+from uavctl.lab.campaign.fleet_page import HEADINGS, NOTE, describe_gains, format_cell, write_fleet_report
+from uavctl.lab.campaign.fleets import SCHEMA as FLEET_SCHEMA
+from uavctl.lab.campaign.fleets import (
+    FleetSummary,
+    is_fleet_file,
+    make_fleet_cells,
+    make_fleet_document,
+    make_fleet_tasks,
+    read_fleet_campaign,
+)
 from uavctl.lab.campaign.page import write_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
 from uavctl.lab.campaign.results import SCHEMA, CampaignRecord, CellSummary
@@ -40,7 +50,7 @@ from uavctl.lab.campaign.trials import (
 )
 from uavctl.lab.trial import COUNT_FIGURES, FIGURE_NOTE, SCENARIO_FIGURES
 
-S = TypeVar("S", CellSummary, TrialSummary)
+S = TypeVar("S", CellSummary, TrialSummary, FleetSummary)
 
 
 class CampaignResult(msgspec.Struct, Generic[S], frozen=True, kw_only=True):
@@ -107,7 +117,7 @@ def fly_campaign(
         raise UsageError("--workers are this machine's, --dask has its own; give one of them")
     if resume and out is None:
         raise UsageError("--resume: give the campaign's folder with --out")
-    campaign: _PreparedCampaign[Any] = _prepare_trials(spec, runs) if is_trial_file(spec) else _prepare_runs(spec, runs)
+    campaign = _prepare(spec, runs)
     begin_s = time.perf_counter()
     store = Store(out or _make_folder_path(campaign.name), campaign.schema)
     store.check(resume)  # the designs may take minutes
@@ -136,7 +146,7 @@ def fly_campaign(
 
 @dataclass(frozen=True)
 class _PreparedCampaign(Generic[S]):
-    """Campaign of the linear or the quadrotor world, ready to fly."""
+    """Campaign of any world, ready to fly."""
 
     name: str  # its name
     text: str  # text of the campaign's file
@@ -144,6 +154,33 @@ class _PreparedCampaign(Generic[S]):
     prepare: Callable[[], tuple[CampaignRecord[Any], Sequence[Work]]]  # makes the document and all tasks
     write: Callable[[Path], tuple[Path, list[S]]]  # writes the page into a folder; returns the figures too
     render: Callable[[CampaignResult[S]], RenderableType]
+
+
+def _prepare(spec: Path, runs: int | None) -> _PreparedCampaign[Any]:
+    """Prepare a campaign in the world that its file names."""
+    if is_trial_file(spec):
+        return _prepare_trials(spec, runs)
+    if is_fleet_file(spec):
+        return _prepare_fleets(spec, runs)
+    return _prepare_runs(spec, runs)
+
+
+def _prepare_fleets(path: Path, runs: int | None) -> _PreparedCampaign[FleetSummary]:
+    """Prepare a campaign of fleets on one radio."""
+    spec, text = read_fleet_campaign(path, runs)
+
+    def prepare() -> tuple[CampaignRecord[Any], Sequence[Work]]:
+        cells = make_fleet_cells(spec)
+        return make_fleet_document(spec, cells), list(make_fleet_tasks(spec, cells))
+
+    return _PreparedCampaign(spec.name, text, FLEET_SCHEMA, prepare, write_fleet_report, _render_fleets)
+
+
+def _render_fleets(result: CampaignResult[FleetSummary]) -> RenderableType:
+    rows = [format_cell(cell) for cell in result.cells]
+    refused = [f"{cell.vehicles} vehicles, {cell.schedule}: {cell.refused}" for cell in result.cells if cell.refused]
+    table = make_table(f"Campaign {result.name}", HEADINGS, rows, ("schedule",))
+    return Group(table, *_format_closing(result, refused, [*describe_gains(result.cells), NOTE]))
 
 
 def _prepare_runs(spec: Path, runs: int | None) -> _PreparedCampaign[CellSummary]:

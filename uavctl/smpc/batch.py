@@ -214,6 +214,10 @@ class BatchSmpc:
         self._captured = np.full(runs, -1, dtype=np.intp)
         self.tally = Tally.zero(runs)
 
+    def renew(self) -> None:
+        """Make new plans in the next step from the positions known, as after a new target."""
+        self._captured[:] = -1
+
     def act(self, information: Information) -> Array:
         """See `BatchController`."""
         steps, age = self._horizon, information.age

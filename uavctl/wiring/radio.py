@@ -13,12 +13,13 @@ from msgspec import Meta
 from scipy.linalg import block_diag
 
 from uavctl.arrays import SECOND_NS, Array
+from uavctl.config.checks import get_position_limits_m
 from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.types import Config
 from uavctl.schedule.ages import compute_periodic_tail
 from uavctl.schedule.channel import TIMESYNC_PAYLOAD_BYTES, Budget, compute_frame_bytes
-from uavctl.schedule.scheduler import ScheduleName
-from uavctl.schedule.value import compute_age_costs, compute_message_values, predict_covariances
+from uavctl.schedule.scheduler import ScheduleName, Scheduler
+from uavctl.schedule.value import compute_age_costs, compute_message_values, compute_weight, predict_covariances
 from uavctl.smpc.estimate import add_bias
 from uavctl.wiring.controller import build_plant, compute_settled_covariance
 from uavctl.wiring.link import build_ages
@@ -192,3 +193,68 @@ def build_message_values(config: Config, radio: RadioConfig) -> tuple[Array, Arr
 def compute_quantile(config: Config) -> float:
     """Return κ of the allowed risk, Φ⁻¹(δ_x)."""
     return NormalDist().inv_cdf(config.smpc.delta_x)
+
+
+class RadioSchedule:
+    """Schedule of a radio for some vehicles, with the weights of their places.
+
+    Attributes:
+        scheduler: Chooses the vehicle of each message.
+
+    Args:
+        configs: Configuration of each vehicle.
+        start_ns: Time of the start [ns].
+
+    Raises:
+        DesignError: A plant is not valid, or the longest wait has no slot for each vehicle.
+    """
+
+    def __init__(self, configs: Sequence[Config], radio: RadioConfig, start_ns: int) -> None:
+        max_wait_slots = compute_max_wait_slots(radio, len(configs))
+        values, stds_m = zip(*(build_message_values(config, radio) for config in configs), strict=True)
+        self._wait_stds_m = [float(stds[min(max_wait_slots, len(stds) - 1)]) for stds in stds_m]
+        self._quantiles = [compute_quantile(config) for config in configs]
+        limits = [list(zip(*get_position_limits_m(config).values(), strict=True)) for config in configs]
+        self._limits_m = [(np.array(lower), np.array(upper)) for lower, upper in limits]
+        self.scheduler = Scheduler(
+            radio.schedule,
+            np.array(values),
+            slot_ns=compute_slot_ns(radio),
+            max_wait_slots=max_wait_slots,
+            loss=radio.loss,
+            feedback_delay_ns=round(radio.feedback_s * SECOND_NS),
+            start_ns=start_ns,
+        )
+
+    def update_weights(self, positions_m: Array, half_gaps_m: Array) -> None:
+        """Set w_i by the distance to the nearest limit, and half of the free distance to another vehicle.
+
+        Args:
+            positions_m: Newest position of each vehicle (N, 3), infinite where there is none.
+            half_gaps_m: Half of the free distance to the nearest other vehicle (N,).
+        """
+        for i in np.flatnonzero(np.isfinite(positions_m[:, 0])).tolist():
+            lower_m, upper_m = self._limits_m[i]
+            columns = positions_m[i, : len(lower_m)]
+            wall_m = min((columns - lower_m).min(), (upper_m - columns).min())
+            distance_m = min(float(wall_m), float(half_gaps_m[i]))
+            weight = compute_weight(distance_m, self._wait_stds_m[i], self._quantiles[i])
+            self.scheduler.vehicles[i].weight = weight
+
+
+def compute_half_gaps_m(positions_m: Array, spacing_m: float) -> Array:
+    """Return half of the free horizontal distance of each vehicle to the nearest other one (N,) [m].
+
+    Height does not count, as in the vehicles' limits.
+
+    Args:
+        positions_m: Newest positions (N, 3), infinite where there is none.
+        spacing_m: Smallest distance of two vehicles [m].
+    """
+    half_gaps_m = np.full(len(positions_m), np.inf)
+    known = np.flatnonzero(np.isfinite(positions_m[:, 0]))
+    horizontal_m = positions_m[known, :2]
+    gaps_m = np.linalg.norm(horizontal_m[:, None] - horizontal_m[None, :], axis=2) - spacing_m
+    np.fill_diagonal(gaps_m, np.inf)
+    half_gaps_m[known] = 0.5 * gaps_m.min(axis=1, initial=np.inf)
+    return half_gaps_m

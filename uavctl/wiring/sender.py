@@ -20,7 +20,6 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.arrays import SECOND_NS
-from uavctl.config.checks import get_position_limits_m
 from uavctl.config.connections import CAMERA_MESSAGE, CAMERA_SYSTEM_ID
 from uavctl.config.types import Config
 from uavctl.frames import Frame, euler_from_quaternion
@@ -40,17 +39,7 @@ from uavctl.mavlink.messages import Message, Position, TimeSync
 from uavctl.mavlink.positions import PositionDecoder
 from uavctl.records import PositionSample, Vec3
 from uavctl.schedule.channel import SIGNATURE_BYTES, BudgetedChannel
-from uavctl.schedule.scheduler import Scheduler
-from uavctl.schedule.value import compute_weight
-from uavctl.wiring.radio import (
-    RadioConfig,
-    build_message_values,
-    compute_answer_period_ns,
-    compute_max_wait_slots,
-    compute_quantile,
-    compute_slot_ns,
-    make_budget,
-)
+from uavctl.wiring.radio import RadioConfig, RadioSchedule, compute_answer_period_ns, compute_half_gaps_m, make_budget
 
 COMPONENT_ID = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 WEIGHT_PERIOD_NS = SECOND_NS // 10  # between two updates of the weights: a vehicle moves 15 cm at 1.5 m/s
@@ -133,9 +122,7 @@ class _Target:
         self.captured_ns_by_stamp: dict[int, int] = {}  # of positions sent
         self.request: tuple[int, int] | None = None  # newest time request: its own time, and its arrival [ns]
         self.answered_ns = start_ns
-        limits = get_position_limits_m(config).values()
         self._max_position_m = config.estimator.max_position_m
-        self.lower_m, self.upper_m = (np.array(side) for side in zip(*limits, strict=True))
 
     def is_plausible(self, sample: PositionSample) -> bool:
         """Return whether the vehicle would not refuse a position as absurd."""
@@ -181,20 +168,9 @@ class PositionSender:
         self._signature_bytes = SIGNATURE_BYTES if radio.signed else 0
         self._answer_period_ns, self._answered_ns = compute_answer_period_ns(radio, len(configs)), start_ns
         self._spacing_m, self._weighted_ns = spacing_m, start_ns
-        slot_ns, max_wait_slots = compute_slot_ns(radio), compute_max_wait_slots(radio, len(configs))
-        values, stds_m = zip(*(build_message_values(config, radio) for config in configs), strict=True)
-        self._wait_stds_m = [float(stds[min(max_wait_slots, len(stds) - 1)]) for stds in stds_m]
-        self._quantiles = [compute_quantile(config) for config in configs]
         self._channel = BudgetedChannel(make_budget(radio))
-        self._scheduler = Scheduler(
-            radio.schedule,
-            np.array(values),
-            slot_ns=slot_ns,
-            max_wait_slots=max_wait_slots,
-            loss=radio.loss,
-            feedback_delay_ns=round(radio.feedback_s * SECOND_NS),
-            start_ns=start_ns,
-        )
+        self._schedule = RadioSchedule(configs, radio, start_ns)
+        self._scheduler = self._schedule.scheduler
 
     def make_time_request(self, source: int, at_ns: int) -> bytes | None:
         """Return a request for the time of a source; None while none is due."""
@@ -307,17 +283,5 @@ class PositionSender:
         return SentAnswer(number, target.encoder.encode_timesync((received_ns + at_ns) // 2, token))
 
     def _update_weights(self) -> None:
-        """Set w_i by the distance to the nearest limit, and half of the free distance to another vehicle."""
         positions_m = np.array([target.position_m or (np.inf,) * 3 for target in self._targets])
-        known = np.flatnonzero(np.isfinite(positions_m[:, 0]))
-        horizontal_m = positions_m[known, :2]
-        # Height does not count, as in the vehicles' limits.
-        gaps_m = np.linalg.norm(horizontal_m[:, None] - horizontal_m[None, :], axis=2) - self._spacing_m
-        np.fill_diagonal(gaps_m, np.inf)
-        half_gaps_m = 0.5 * gaps_m.min(axis=1, initial=np.inf)
-        for i, half_gap_m in zip(known.tolist(), half_gaps_m.tolist(), strict=True):
-            target = self._targets[i]
-            columns = positions_m[i, : len(target.lower_m)]
-            wall_m = min((columns - target.lower_m).min(), (target.upper_m - columns).min())
-            weight = compute_weight(min(float(wall_m), half_gap_m), self._wait_stds_m[i], self._quantiles[i])
-            self._scheduler.vehicles[i].weight = weight
+        self._schedule.update_weights(positions_m, compute_half_gaps_m(positions_m, self._spacing_m))

@@ -22,6 +22,7 @@ class Stream(IntEnum):
     START = 2
     POSITION_NOISE = 3
     INERTIAL = 4
+    REPORT = 5
 
 
 @dataclass(frozen=True, eq=False)
