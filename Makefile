@@ -9,8 +9,9 @@ STAMP := $(VENV)/.installed
 
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
 CLIENTS := .venv-clients
+ROS2 := .venv-ros2
 
-.PHONY: fly test test-all test-long test-manual test-clients mutation docs site clean
+.PHONY: fly test test-all test-long test-manual test-clients test-ros2 mutation docs site clean
 
 fly: $(FLIES)
 	$(VENV)/bin/uavctl loopback --udp --config room
@@ -35,6 +36,10 @@ test-clients: $(STAMP) $(CLIENTS)/.installed
 	UAVCTL_MAVSDK3_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk3/bin/python \
 	UAVCTL_MAVPROXY_PYTHON=$(CURDIR)/$(CLIENTS)/mavproxy/bin/python \
 	$(VENV)/bin/python -m pytest -n 0 tests/clients
+
+# Real nodes of ROS 2 over localhost, in an environment that has the extra: no other test needs it.
+test-ros2: $(ROS2)/.installed
+	$(ROS2)/bin/python -m pytest -n 0 tests/ros2
 
 # The safety core: every small change of it fails one of its own tests (docs/safety-core.md). About 20 minutes.
 mutation: $(STAMP)
@@ -69,5 +74,12 @@ $(CLIENTS)/.installed: constraints-clients.txt
 	$(CLIENTS)/mavproxy/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-clients.txt pyserial pymavlink
 	touch $@
 
+$(ROS2)/.installed: pyproject.toml constraints.txt constraints-ros2.txt
+	$(PYTHON) -m venv $(ROS2)
+	$(ROS2)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt setuptools wheel
+	$(ROS2)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -c constraints-ros2.txt \
+		--no-build-isolation -e '.[ros2]' hypothesis pytest pytest-xdist
+	touch $@
+
 clean:
-	rm -rf $(VENV) $(CLIENTS) build dist site *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) $(ROS2) build dist site *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

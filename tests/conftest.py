@@ -50,9 +50,9 @@ def pytest_report_header() -> str:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    # Real clients need interpreters of their own: `make test-clients`.
-    asked = any("clients" in argument for argument in config.args)
-    return True if collection_path.name == "clients" and not asked else None
+    # Real clients and nodes of ROS 2 need interpreters of their own: `make test-clients`, `make test-ros2`.
+    name = collection_path.name
+    return True if name in ("clients", "ros2") and not any(name in argument for argument in config.args) else None
 
 
 @pytest.hookimpl(wrapper=True)

@@ -139,6 +139,26 @@ def convert_pose_to_frd(position_m: Vec3, attitude: Quaternion, up: Up) -> tuple
     return _AXES_TO_FRD[up](position_m), (w, *_AXES_TO_FRD[up]((x, y, z)))
 
 
+def convert_covariance_to_ned(covariance: Sequence[float], convention: Convention) -> tuple[float, ...]:
+    """Convert the covariance of a pose to local NED with the same north.
+
+    Args:
+        covariance: 6 x 6 by rows; position [m], then small rotations about the fixed axes [rad].
+
+    Returns:
+        The upper triangle of the converted matrix, by rows.
+    """
+    convert = _AXES_TO_NED[convention]
+
+    def convert_columns(rows: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
+        return [(*convert((a, b, c)), *convert((d, e, f))) for a, b, c, d, e, f in rows]
+
+    # B C B', B = diag(A, A)
+    half = convert_columns([covariance[i : i + 6] for i in range(0, 36, 6)])
+    rows = convert_columns(list(zip(*half, strict=True)))
+    return tuple([value for i, row in enumerate(rows) for value in row[i:]])
+
+
 def rotation_to_ned(convention: Convention) -> Quaternion:
     """Return the rotation (w, x, y, z) from a convention to local NED with the same north; it is its own inverse."""
     return _AXES_ROTATION_TO_NED[convention]

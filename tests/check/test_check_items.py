@@ -310,8 +310,8 @@ def test_without_a_position_the_hint_is_of_who_should_have_sent_it() -> None:
     bridge = Preflight(load_config("room-hahn-stursberg"), make_links, 0).make_items(3 * S)
     motive = Preflight(load_config("room-hahn-stursberg", [MOTIVE]), make_links, 0).make_items(3 * S)
     hints = [next(one.hint for one in items if one.name == "positions") for items in (bridge, motive)]
-    assert "VISION_POSITION_ESTIMATE" in hints[0] and "Motive" not in hints[0]
-    assert "Motive track the body" in hints[1] and "VISION_POSITION_ESTIMATE" not in hints[1]
+    assert "VISION_POSITION_ESTIMATE" in hints[0] and "track the body" not in hints[0]
+    assert "track the body of natnet://" in hints[1] and "VISION_POSITION_ESTIMATE" not in hints[1]
 
 
 def told_by_motive(*place: float) -> Preflight:

@@ -28,7 +28,8 @@ from uavctl.event_codes import EventCode
 from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
 from uavctl.io.camera import COUNTS, READY, BodyPose, Echo
-from uavctl.io.camera_host import OVERRUN, CameraHost
+from uavctl.io.camera_host import CameraHost
+from uavctl.io.daemon_pipe import OVERRUN
 from uavctl.io.helper_process import MAX_RESTARTS
 from uavctl.io.natnet import ECHO
 from uavctl.io.signed_connection import open_links

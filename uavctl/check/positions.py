@@ -62,7 +62,7 @@ def _report_no_positions(data: CheckData, config: Config) -> Item:
             "; to fly on the vehicle's own estimate, which is heard: --set 'source.messages=[\"LOCAL_POSITION_NED\"]'"
         )
     if uses_camera_system(config):
-        hint = f"does Motive track the body of {config.daemon.mocap}, and stream rigid bodies? See docs/sources.md"
+        hint = f"do the cameras track the body of {config.daemon.mocap}, and stream it? See docs/sources.md"
     return make_item("positions", ItemState.BAD, f"none ({counts})", "positions of the source", hint)
 
 

@@ -66,6 +66,14 @@ CAMERA_SYSTEMS = {
         advice="does QTM run there, with a measurement or its preview, and does no firewall block TCP 22223?",
         up="z",
     ),
+    "ros2": CameraSystem(  # a topic: its URL has no server, see `uavctl.io.ros2_url`
+        camera="",
+        package="rclpy",
+        extra="ros2",
+        port=0,
+        advice="does the driver run and see the body, with our ROS_DOMAIN_ID, and does discovery reach it?",
+        up="z",
+    ),
 }
 SOURCE_GROUP = "uavctl.sources"  # entry points of those of other packages
 _TRANSPORTS = ("udpin", "udpout", "tcp", "serial")  # MAVLink as it is

@@ -22,6 +22,8 @@ class BodyPose:
     exposed_ns: int  # middle of the exposure in the cameras' clock [ns]
     position_m: Vec3  # in the room's axes forward, right, down [m]
     attitude: Quaternion  # body axes forward, right, down to the room's (w, x, y, z)
+    # covariance, its upper triangle by rows: position [m], rotations about the room's axes [rad]; None: unknown
+    covariance: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

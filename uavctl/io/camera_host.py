@@ -11,16 +11,14 @@ It is started as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT UP INTER
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import resource
 import select
 import socket
 import struct
 import sys
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from importlib import import_module
@@ -31,19 +29,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import CAMERA_SYSTEM_ID
 from uavctl.errors import in_words
 from uavctl.frames import Up
-from uavctl.io.camera import (
-    ANSWER_S,
-    COUNTS,
-    FAILED,
-    LARGEST,
-    READY,
-    REFUSED,
-    UNREACHABLE,
-    BodyPose,
-    Camera,
-    CameraError,
-    Echo,
-)
+from uavctl.io.camera import ANSWER_S, LARGEST, BodyPose, Camera, CameraError, Echo
+from uavctl.io.daemon_pipe import DaemonPipe, serve_daemon
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import TimeSync
 
@@ -69,7 +56,7 @@ class CameraMessageEncoder:
                 *item.position_m,
                 list(item.attitude),
                 *(math.nan,) * 6,  # rates are not measured
-                _UNKNOWN,
+                _UNKNOWN if item.covariance is None else list(item.covariance),
                 _UNKNOWN,
                 0,
                 mavlink.MAV_ESTIMATOR_TYPE_MOCAP,
@@ -91,15 +78,11 @@ def parse_time_requests(data: bytes) -> tuple[int, ...]:
     )
 
 
-MAX_QUEUE = 64  # newest messages that are kept while the daemon does not read
-OVERRUN = "source-queue"
 NOT_SERVER = "not-listed"
 UNREADABLE = "unreadable"
-_PIPE_BYTES = 8192  # small kernel buffer: newer messages cannot replace those in it
 _MAX_READS = 64
 _POLL_S = 0.1
 _RECONNECT_S = 0.5  # between two attempts to connect a lost stream
-_COUNTS_PERIOD_S = 0.5
 _MEMORY_LIMIT = 2**30
 
 
@@ -118,17 +101,13 @@ class CameraHost:
         self._cameras, self._pipe, self._server, self._interface = cameras, pipe, server, interface
         self._first = next(iter(cameras.values()))
         self._encoders = [CameraMessageEncoder(number) for number in range(len(cameras))]
-        self._queue: deque[bytes] = deque()
+        self._daemon = DaemonPipe(pipe)
         self._dropped: Counter[str] = Counter()
-        self._reported_counts: Counter[str] = Counter()
-        self._reported_s = 0.0
-        self._is_ready = False
         self._group: tuple[str, int] | None = None
         self._group_socket: socket.socket | None = None
         self._is_stream: bool = getattr(self._first, "stream", False)
         self._connected_s = time.monotonic()  # of the last attempt
         self._server_socket: socket.socket | None = self._connect(ANSWER_S)
-        pipe.setblocking(False)
 
     def _connect(self, timeout_s: float) -> socket.socket:
         """Open the socket to the server."""
@@ -170,9 +149,9 @@ class CameraHost:
         """
         start_s = time.monotonic()
         while self._poll():
-            if not self._is_ready and time.monotonic() - start_s > ANSWER_S:
+            if not self._daemon.is_ready and time.monotonic() - start_s > ANSWER_S:
                 raise TimeoutError(self._describe_missing())
-            self._report_counts()
+            self._daemon.report_counts(self._count_dropped())
 
     def _describe_missing(self) -> str:
         body, camera = next((body, camera) for body, camera in self._cameras.items() if not camera.ready)
@@ -194,11 +173,12 @@ class CameraHost:
         self._send_once(data for camera in self._cameras.values() for data in camera.due(at_ns))
         self._follow_group()
         sources = [source for source in (self._server_socket, self._group_socket) if source is not None]
-        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._queue else [], [], _POLL_S)
+        writers = [self._pipe] if self._daemon.has_waiting else []
+        readable, _, _ = select.select([self._pipe, *sources], writers, [], _POLL_S)
         for source in sources:
             if source in readable:
                 self._receive(source)
-        self._flush()
+        self._daemon.flush()
         return self._pipe not in readable or self._forward_time_requests()
 
     def _send_once(self, requests: Iterable[bytes]) -> None:
@@ -235,12 +215,10 @@ class CameraHost:
                 self._dropped[NOT_SERVER] += 1
                 continue
             messages = self._make_messages(data)
-            is_ready = all(camera.ready for camera in self._cameras.values())
-            if is_ready and not self._is_ready:  # before any position: the daemon waits for this message
-                self._is_ready = True
-                self._queue_message(READY)
-            for message in messages if self._is_ready else ():
-                self._queue_message(message)
+            if all(camera.ready for camera in self._cameras.values()):
+                self._daemon.report_ready()
+            for message in messages if self._daemon.is_ready else ():
+                self._daemon.queue_message(message)
 
     def _make_messages(self, data: bytes) -> list[bytes]:
         """Return the messages for the daemon that a datagram gives; none of one that cannot be handled.
@@ -270,29 +248,13 @@ class CameraHost:
             self._send_once(camera.ask_time(token) for camera in self._cameras.values())
         return bool(data)
 
-    def _queue_message(self, message: bytes) -> None:
-        if len(self._queue) >= MAX_QUEUE:
-            self._queue.popleft()
-            self._dropped[OVERRUN] += 1
-        self._queue.append(message)
-        self._flush()
-
-    def _flush(self) -> None:
-        while self._queue:
-            try:
-                self._pipe.send(self._queue[0])
-            except OSError:  # full: sent later; closed: found at the next read
-                return
-            self._queue.popleft()
-
-    def _report_counts(self) -> None:
+    def _count_dropped(self) -> Counter[str]:
+        """Count what was dropped, by reason; of several bodies each for itself."""
         counts = self._dropped.copy()
         for body, camera in self._cameras.items():
             prefix = f"{body}: " if len(self._cameras) > 1 else ""
             counts.update({f"{prefix}{reason}": count for reason, count in camera.dropped.items()})
-        if counts != self._reported_counts and time.monotonic() - self._reported_s >= _COUNTS_PERIOD_S:
-            self._reported_counts, self._reported_s = counts, time.monotonic()
-            self._queue_message(COUNTS + json.dumps(counts).encode())
+        return counts
 
     def _follow_group(self) -> None:
         """Join the multicast group of the server, if there is one."""
@@ -346,23 +308,16 @@ def _make_camera(camera: str, body: str, up: Up) -> Camera:
 def main(arguments: list[str]) -> int:
     """Run for the daemon that started this process."""
     descriptor, camera, address, port, up, interface, *bodies = arguments
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_LIMIT, _MEMORY_LIMIT))
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
-    with socket.socket(fileno=int(descriptor)) as pipe:
-        pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)
+
+    def run(pipe: socket.socket) -> None:
+        cameras = {body: _make_camera(camera, body, cast(Up, up)) for body in bodies}
+        host = CameraHost(cameras, pipe, (address, int(port)), interface)
         try:
-            cameras = {body: _make_camera(camera, body, cast(Up, up)) for body in bodies}
-            host = CameraHost(cameras, pipe, (address, int(port)), interface)
-            try:
-                host.run()
-            finally:
-                host.close()
-        except CameraError as error:
-            pipe.send(REFUSED + str(error).encode())
-        except OSError as error:
-            pipe.send(UNREACHABLE + str(error.strerror or error).encode())
-        except Exception as error:  # noqa: BLE001 the daemon reports the cause
-            pipe.send(FAILED + in_words(error).encode())
+            host.run()
+        finally:
+            host.close()
+
+    serve_daemon(int(descriptor), _MEMORY_LIMIT, run)
     return 0
 
 

@@ -18,6 +18,7 @@ from uavctl.io.base import BaseConnection, Connection
 from uavctl.io.camera import ANSWER_S, COUNTS, FAILED, LARGEST, READY, REFUSED, UNREACHABLE
 from uavctl.io.camera_url import parse_camera_url
 from uavctl.io.helper_process import MAX_RESTARTS, HelperProcess
+from uavctl.io.ros2_url import SCHEME, parse_ros2_url
 
 _MAVLINK = (0xFD, 0xFE)
 _START_S = 60.0  # for the interpreter of the process, on a busy computer
@@ -32,14 +33,21 @@ class CameraProcessConnection(BaseConnection):
     `closed`. While only the server is gone the process asks on, and nothing comes.
 
     Args:
-        arguments: of `uavctl.io.camera_host`, without the pipe.
+        arguments: of the process, without the pipe.
         advice: possible reasons why the server does not answer.
         now: clock for the times of arrival [ns].
         rules: how many messages a second are taken.
+        module: the process's.
     """
 
     def __init__(
-        self, url: str, arguments: list[str], advice: str, now: Callable[[], int], rules: AdmissionRules
+        self,
+        url: str,
+        arguments: list[str],
+        advice: str,
+        now: Callable[[], int],
+        rules: AdmissionRules,
+        module: str = "uavctl.io.camera_host",
     ) -> None:
         super().__init__(url, now)
         self._advice = advice
@@ -50,7 +58,7 @@ class CameraProcessConnection(BaseConnection):
         self._refused_before: Counter[str] = Counter()  # what earlier processes counted
         self._restarts = 0
         self._cause = ""  # last words of the process
-        self._arguments = arguments
+        self._module, self._arguments = module, arguments
         try:
             self._start()
         except OSError as error:  # no memory, or too many processes
@@ -62,7 +70,7 @@ class CameraProcessConnection(BaseConnection):
         Raises:
             OSError: The system does not allow that now.
         """
-        self._helper = HelperProcess("uavctl.io.camera_host", self._arguments)
+        self._helper = HelperProcess(self._module, self._arguments)
         self._socket, self._process = self._helper.socket, self._helper.process
 
     def wait_until_ready(self) -> None:
@@ -174,7 +182,26 @@ def _open_camera(urls: Sequence[str], now: Callable[[], int], rules: AdmissionRu
     if not AllowList(rules.allow).allows(address):
         raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
     arguments = [system.camera, address, str(camera_url.port), camera_url.up, camera_url.interface, *bodies]
-    connection = CameraProcessConnection(url, arguments, system.advice, now, rules)
+    return _wait_for(CameraProcessConnection(url, arguments, system.advice, now, rules))
+
+
+def _open_topic(url: str, now: Callable[[], int], rules: AdmissionRules) -> Connection:
+    """Open a topic of ROS 2; see `open_source`.
+
+    Raises:
+        ConnectionSpecError: the URL or the topic is not as it has to be.
+        ExtraMissingError: a package of ROS 2 is not installed.
+    """
+    ros2_url, system = parse_ros2_url(url), get_camera_system(SCHEME)
+    for package in (system.package, "geometry_msgs", "nav_msgs"):
+        if find_spec(package) is None:
+            raise ExtraMissingError(package, system.extra)
+    arguments = [ros2_url.topic, ros2_url.frame, ros2_url.child, ros2_url.clock]
+    return _wait_for(CameraProcessConnection(url, arguments, system.advice, now, rules, "uavctl.io.ros2_host"))
+
+
+def _wait_for(connection: CameraProcessConnection) -> CameraProcessConnection:
+    """Return a connection once it is ready; close it if it does not get so."""
     with ExitStack() as stack:
         stack.callback(connection.close)
         connection.wait_until_ready()

@@ -6,6 +6,7 @@ and answers to TIMESYNC. The reasons for MAVLink at this place:
 
 * Recording, replay, check, relay and the rules for stamps and clocks handle one language. The recording holds the bytes
   that the controller received. A replay needs neither cameras nor their package.
+* A topic of ROS 2 has a process of its own kind (`uavctl.io.ros2_host`): its middleware receives by itself.
 * Another camera system is one class (`uavctl.io.camera.Camera`): ours (`uavctl.config.connections.CAMERA_SYSTEMS`) or
   that of another package, by its entry point `uavctl.sources` or as `module:Class`.
 
@@ -22,7 +23,8 @@ from collections.abc import Callable, Sequence
 from uavctl.config.connections import parse_camera_scheme
 from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
-from uavctl.io.camera_process import _open_camera
+from uavctl.io.camera_process import _open_camera, _open_topic
+from uavctl.io.ros2_url import SCHEME
 from uavctl.io.transport import DEFAULT_RULES, open_connection
 
 
@@ -32,13 +34,17 @@ def open_source(
     """Open a source of positions.
 
     Args:
-        url: a camera system's, as natnet://SERVER[:PORT]/BODY, or a URL of `uavctl.io.transport.open_connection`.
+        url: a camera system's, as natnet://SERVER[:PORT]/BODY or ros2://TOPIC, or a URL of
+            `uavctl.io.transport.open_connection`.
         now: clock for the times of arrival [ns].
 
     Raises:
         ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; names the remedy.
     """
-    return _open_camera([url], now, rules) if parse_camera_scheme(url) else open_connection(url, now, rules)
+    scheme = parse_camera_scheme(url)
+    if scheme == SCHEME:
+        return _open_topic(url, now, rules)
+    return _open_camera([url], now, rules) if scheme else open_connection(url, now, rules)
 
 
 def open_bodies(

@@ -1,0 +1,182 @@
+"""A topic of real nodes over localhost as the source of positions."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import pytest
+import rclpy
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from patience import LIMIT_S, wait_until
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+
+from uavctl.errors import ConnectionSpecError
+from uavctl.io.base import Connection
+from uavctl.io.ros2_host import NO_PUBLISHER
+from uavctl.io.sources import open_source
+from uavctl.mavlink.codec import decode
+from uavctl.mavlink.encoder import Encoder
+from uavctl.mavlink.messages import Position, TimeSync
+
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")  # of a parser that rclpy imports
+TOPIC, PERIOD_S = "/drone/pose", 0.01
+
+
+@pytest.fixture(scope="module")
+def node() -> Iterator[Any]:
+    """A node of this process, in a domain of its own on this machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+        rclpy.init(args=["--ros-args", "--disable-external-lib-logs"])
+        yield rclpy.create_node("driver")
+        rclpy.shutdown()
+
+
+def make_message(kind: Any, stamp: Any) -> Any:
+    """A pose at east 1, north 2, up 3 m, heading east."""
+    message = kind()
+    message.header.stamp, message.header.frame_id = stamp, "map"
+    place = {"x": 1.0, "y": 2.0, "z": 3.0}
+    if kind is TransformStamped:
+        target, message.child_frame_id = message.transform.translation, "drone"
+    else:
+        target = message.pose.position if kind is PoseStamped else message.pose.pose.position
+    for axis, value in place.items():
+        setattr(target, axis, value)
+    return message
+
+
+@contextmanager
+def published(node: Any, topic: str, kind: Any, make: Callable[[], Any], qos: Any = qos_profile_sensor_data) -> Any:
+    """Publish a message again and again, in a thread of its own."""
+    publisher, is_over = node.create_publisher(kind, topic, qos), threading.Event()
+
+    def publish() -> None:
+        while not is_over.wait(PERIOD_S):
+            publisher.publish(make())
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+        node.destroy_publisher(publisher)
+
+
+def poses_of(node: Any, kind: Any) -> Callable[[], Any]:
+    return lambda: make_message(kind, node.get_clock().now().to_msg())
+
+
+def receive(connection: Connection, kind: type, count: int = 1) -> list[tuple[Any, int]]:
+    """The next messages of a kind, each with the time of its arrival [ns]."""
+    found: list[tuple[Any, int]] = []
+
+    def look() -> bool:
+        found.extend(
+            (message, at_ns)
+            for data, at_ns in connection.receive()
+            for message in decode(data).messages
+            if isinstance(message, kind)
+        )
+        return len(found) >= count
+
+    wait_until(look, f"{count} {kind.__name__}", pause_s=0.001)
+    return found
+
+
+@pytest.mark.parametrize("kind", [PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped])
+@pytest.mark.parametrize("qos", [qos_profile_sensor_data, 10], ids=["best-effort", "reliable"])
+def test_each_type_comes_as_a_position_in_ned(node: Any, kind: Any, qos: Any) -> None:
+    with (
+        published(node, TOPIC, kind, poses_of(node, kind), qos),
+        closing(open_source("ros2://drone/pose?frame=map")) as connection,
+    ):
+        before_us = time.time_ns() // 1000 - int(LIMIT_S * 1e6)
+        found = receive(connection, Position, 20)
+    stamps = [position.stamp_us for position, _ in found]
+    assert stamps == sorted(set(stamps)) and before_us < stamps[0] <= stamps[-1] <= time.time_ns() // 1000
+    for position, _ in found:
+        assert position.position_m == pytest.approx((2.0, 1.0, -3.0))
+        assert position.attitude is not None
+        assert [abs(value) for value in position.attitude] == pytest.approx([0.5**0.5, 0.0, 0.0, 0.5**0.5])
+
+
+def ask_time(connection: Connection) -> tuple[TimeSync, int, int]:
+    """The answer to a time request, and our times around it [ns]."""
+    sent_ns = time.monotonic_ns()
+    connection.send(Encoder(245, 25).encode_timesync(0, sent_ns))
+    answer, received_ns = receive(connection, TimeSync)[0]
+    assert answer.ts1_ns == sent_ns
+    return answer, sent_ns, received_ns
+
+
+def test_the_system_s_time_is_answered_where_the_stamps_are_of_it(node: Any) -> None:
+    with (
+        published(node, TOPIC, PoseStamped, poses_of(node, PoseStamped)),
+        closing(open_source("ros2://drone/pose?clock=system")) as connection,
+    ):
+        begin_ns = time.time_ns()
+        answer, _, _ = ask_time(connection)
+        assert begin_ns <= answer.tc1_ns <= time.time_ns()
+
+
+def test_stamps_of_a_simulation_are_put_into_our_time_by_its_clock(node: Any) -> None:
+    begin_ns = time.monotonic_ns()
+
+    def simulated() -> Any:
+        return rclpy.time.Time(nanoseconds=1 + time.monotonic_ns() - begin_ns).to_msg()
+
+    with (
+        published(node, "/clock", Clock, lambda: Clock(clock=simulated())),
+        published(node, TOPIC, PoseStamped, lambda: make_message(PoseStamped, simulated())),
+        closing(open_source("ros2://drone/pose?clock=sim")) as connection,
+    ):
+        answer, sent_ns, received_ns = ask_time(connection)
+        # The clock was read between request and answer, or just before: a message may have been on its way.
+        assert sent_ns - 1e9 < begin_ns + answer.tc1_ns <= received_ns
+        position, at_ns = receive(connection, Position)[0]
+        assert 0 < begin_ns + position.stamp_us * 1000 <= at_ns
+
+
+def test_topics_that_cannot_be_used_are_errors_with_their_reason(node: Any) -> None:
+    with published(node, "/other/pose", PoseStamped, poses_of(node, PoseStamped)):
+        with pytest.raises(ConnectionSpecError, match=r"no publisher of /drone/pose within .*: /other/pose"):
+            open_source("ros2://drone/pose")
+        with pytest.raises(ConnectionSpecError, match="in frame 'map', not 'world'"):
+            open_source("ros2://other/pose?frame=world")
+    with (
+        published(node, "/drone/clock", Clock, Clock),
+        pytest.raises(ConnectionSpecError, match="has rosgraph_msgs/msg/Clock"),
+    ):
+        open_source("ros2://drone/clock")
+    with (
+        published(node, TOPIC, PoseStamped, poses_of(node, PoseStamped)),
+        published(node, TOPIC, PoseStamped, poses_of(node, PoseStamped)),
+        pytest.raises(ConnectionSpecError, match="2 publishers"),
+    ):
+        open_source("ros2://drone/pose")
+
+
+def test_a_driver_that_starts_again_is_heard_again(node: Any) -> None:
+    with closing(start_source(node)) as connection:
+        receive(connection, Position)
+        wait_until(lambda: not connection.receive() and connection.refused[NO_PUBLISHER] > 0, "nobody publishes")
+        with published(node, TOPIC, PoseStamped, poses_of(node, PoseStamped)):
+            receive(connection, Position)
+        assert not connection.closed
+
+
+def start_source(node: Any) -> Connection:
+    """A source whose driver has just ended."""
+    with published(node, TOPIC, PoseStamped, poses_of(node, PoseStamped)):
+        return open_source("ros2://drone/pose")

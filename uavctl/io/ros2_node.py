@@ -1,0 +1,85 @@
+"""Node of ROS 2, by `rclpy`: what our processes use of it. ROS is imported when a node is opened, not before.
+
+Domain, discovery and middleware come from the environment, as for every node (ROS_DOMAIN_ID and others).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+from uavctl.errors import in_words
+from uavctl.io.camera import CameraError
+
+EXTRA = "ros2"
+# Logs go nowhere: nobody reads the console of a process, and a file of each start would stay behind.
+_INIT_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs", "--disable-rosout-logs", "--disable-stdout-logs"]
+
+
+class Ros2Node:
+    """A node and the executor that calls it back."""
+
+    def __init__(self, node: Any, executor: Any, sensor_qos: Any) -> None:
+        self._node, self._executor, self._sensor_qos = node, executor, sensor_qos
+
+    def spin(self, timeout_s: float) -> None:
+        """Handle one message or request that has come, or wait for it."""
+        self._executor.spin_once(timeout_sec=timeout_s)
+
+    def subscribe(self, kind: str, topic: str, receive: Callable[[Any], None]) -> None:
+        """Subscribe best-effort with a short queue, as for sensor data.
+
+        Args:
+            kind: Type of the messages, as `geometry_msgs/msg/PoseStamped`.
+        """
+        self._node.create_subscription(import_type(kind), topic, receive, self._sensor_qos)
+
+    def list_publishers(self, topic: str) -> list[tuple[str, str]]:
+        """Return the node and the type of each publisher of a topic."""
+        return [
+            (publisher.node_name, publisher.topic_type) for publisher in self._node.get_publishers_info_by_topic(topic)
+        ]
+
+    def list_topics(self) -> list[tuple[str, list[str]]]:
+        """Return the name and the types of each topic."""
+        return list(self._node.get_topic_names_and_types())
+
+
+def import_type(name: str) -> Any:
+    """Import the type of a message or a service, as `geometry_msgs/msg/PoseStamped`."""
+    package, folder, kind = name.split("/")
+    return getattr(import_module(f"{package}.{folder}"), kind)
+
+
+@contextmanager
+def open_node(name: str) -> Iterator[Ros2Node]:
+    """Open a node of this process.
+
+    Args:
+        name: Name of the node, before the number of the process.
+
+    Raises:
+        CameraError: ROS 2 cannot be started.
+    """
+    try:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import qos_profile_sensor_data
+        from rclpy.signals import SignalHandlerOptions
+
+        rclpy.init(args=_INIT_ARGUMENTS, signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node(f"{name}_{os.getpid()}", enable_rosout=False, start_parameter_services=False)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+    except Exception as error:
+        raise CameraError(
+            f"ROS 2 cannot be started ({in_words(error)}); see RMW_IMPLEMENTATION and ROS_DOMAIN_ID, or "
+            f"pip install 'uavctl[{EXTRA}]'"
+        ) from error
+    try:
+        yield Ros2Node(node, executor, qos_profile_sensor_data)
+    finally:
+        rclpy.shutdown()
