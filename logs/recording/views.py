@@ -69,7 +69,7 @@ _LEVEL: Fields = {"w": 1.0}
 _LABEL_M = (0.0, 0.0, -0.35)  # above the vehicle: down is positive
 _IN_CONTROL = frozenset({ControlMode.WAIT, ControlMode.TRACK})
 _LEVELS = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
-_EDGES = [  # corners whose numbers differ in one bit
+BOX_EDGES = [  # corners whose numbers differ in one bit
     corner for first, second in product(range(8), repeat=2) if first < second and (first ^ second) in (1, 2, 4)
     for corner in (first, second)
 ]  # fmt: skip
@@ -146,7 +146,7 @@ def make_log_message(event: Event, at_ns: int) -> Log:
 
 def draw_room(at_ns: int, design: DesignView) -> SceneUpdate:
     """Draw the position limits as a box."""
-    lower, upper = _get_room_sides(design, design.state_box.lower, design.state_box.upper)
+    lower, upper = get_room_sides(design, design.state_box.lower, design.state_box.upper)
     return _make_update(_make_entity(at_ns, "limits", lines=[_make_box(lower, upper, _LIMITS)]))
 
 
@@ -162,7 +162,7 @@ def draw_plan(
     places = design.positions_of(plan.states) if positions is None else positions
     diameters = 2.0 * _compute_semi_axes(design, plan.backoff_x)
     spheres = [_make_ellipsoid(*stage) for stage in zip(places.tolist(), diameters.tolist(), strict=True)]
-    lower, upper = _get_room_sides(design, *tighten_limits(design, plan.backoff_x, -1))
+    lower, upper = get_room_sides(design, *tighten_limits(design, plan.backoff_x, -1))
     entities = [
         _make_entity(at_ns, "predicted path", lines=[_make_line(places.tolist(), _PLANNED, 3.0)]),
         _make_entity(at_ns, "predicted spread", spheres=spheres),
@@ -234,10 +234,10 @@ def _make_line(places_m: Iterable[Sequence[float]], colour: Fields, pixels: floa
 
 def _make_box(lower: Vec3, upper: Vec3, colour: Fields) -> Fields:
     line = _make_line(product(*zip(lower, upper, strict=True)), colour, 1.5)
-    return {**line, "type": LinePrimitive.LINE_LIST, "indices": _EDGES}
+    return {**line, "type": LinePrimitive.LINE_LIST, "indices": BOX_EDGES}
 
 
-def _get_room_sides(design: DesignView, lower: Array, upper: Array) -> tuple[Vec3, Vec3]:
+def get_room_sides(design: DesignView, lower: Array, upper: Array) -> tuple[Vec3, Vec3]:
     """Return the sides of the room in local NED [m]; open ones lie near the target, axes without motion are flat."""
     centre = np.array(design.target)
     return (

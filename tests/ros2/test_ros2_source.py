@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from typing import Any
 
 import pytest
 import rclpy
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from node_rig import make_node, published
 from patience import LIMIT_S, wait_until
 from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
@@ -26,18 +25,13 @@ from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.messages import Position, TimeSync
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")  # of a parser that rclpy imports
-TOPIC, PERIOD_S = "/drone/pose", 0.01
+TOPIC = "/drone/pose"
 
 
 @pytest.fixture(scope="module")
 def node() -> Iterator[Any]:
-    """A node of this process, in a domain of its own on this machine."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-        rclpy.init(args=["--ros-args", "--disable-external-lib-logs"])
-        yield rclpy.create_node("driver")
-        rclpy.shutdown()
+    with make_node() as made:
+        yield made
 
 
 def make_message(kind: Any, stamp: Any) -> Any:
@@ -52,25 +46,6 @@ def make_message(kind: Any, stamp: Any) -> Any:
     for axis, value in place.items():
         setattr(target, axis, value)
     return message
-
-
-@contextmanager
-def published(node: Any, topic: str, kind: Any, make: Callable[[], Any], qos: Any = qos_profile_sensor_data) -> Any:
-    """Publish a message again and again, in a thread of its own."""
-    publisher, is_over = node.create_publisher(kind, topic, qos), threading.Event()
-
-    def publish() -> None:
-        while not is_over.wait(PERIOD_S):
-            publisher.publish(make())
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
-        yield
-    finally:
-        is_over.set()
-        thread.join()
-        node.destroy_publisher(publisher)
 
 
 def poses_of(node: Any, kind: Any) -> Callable[[], Any]:

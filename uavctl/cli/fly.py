@@ -19,6 +19,7 @@ from uavctl.cli.error_stream import limit_output_wait
 from uavctl.cli.flying import (
     Live,
     LivePort,
+    Ros2Choice,
     check_take_off,
     choose_live_port,
     conclude_flight,
@@ -43,6 +44,7 @@ from uavctl.daemon.flight_orders import FlightOrders, TickFollower, check_places
 from uavctl.daemon.landing_guard import guard_landing
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.daemon.tick_limit import ENGAGED_LIMIT_S, LIMIT_S, limit_ticks
+from uavctl.errors import UsageError
 from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
@@ -70,6 +72,12 @@ def fly(
     realtime: Annotated[bool, Parameter(negative=(), help="SCHED_FIFO and locked memory, as far as permitted")] = False,
     live: Live = False,
     live_port: LivePort = None,
+    ros2: Annotated[
+        str | None, Parameter(help="namespace of ROS 2 to publish the flight in, from a process of its own")
+    ] = None,
+    ros2_orders: Annotated[
+        bool, Parameter(negative=(), help="take orders of any node of ROS 2, below the namespace of --ros2")
+    ] = False,
 ) -> int:
     """Fly a vehicle that the pilot arms and switches to OFFBOARD or GUIDED; Ctrl-C brakes, then lands it.
 
@@ -84,6 +92,8 @@ def fly(
     """
     take_off_m = check_take_off(arm, takeoff)
     view_port = choose_live_port(live=live, port=live_port)
+    if ros2_orders and ros2 is None:
+        raise UsageError("--ros2-orders needs --ros2 NAMESPACE: orders are services below it")
     overrides = [*make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap), *make_goto_overrides(goto)]
     summary = fly_daemon(
         common.with_overrides(overrides).load(),
@@ -94,6 +104,8 @@ def fly(
         control=control,
         realtime=realtime,
         view_port=view_port,
+        ros2=ros2,
+        ros2_orders=ros2_orders,
     )
     with limit_output_wait():
         common.show("fly", summary, lambda: make_summary_table(summary))
@@ -110,6 +122,8 @@ def fly_daemon(
     control: Path | None = None,
     realtime: bool = False,
     view_port: int | None = None,
+    ros2: str | None = None,
+    ros2_orders: bool = False,
     follower: TickFollower | None = None,
 ) -> FlightSummary:
     """Fly a vehicle until the end, record it, and print how it ended.
@@ -123,6 +137,8 @@ def fly_daemon(
         control: Folder of the socket for orders; None: the user's folder.
         realtime: SCHED_FIFO and locked memory, as far as permitted.
         view_port: TCP port of a live view; None: no view.
+        ros2: Namespace of ROS 2 to publish the flight in; None: none.
+        ros2_orders: Whether any node of ROS 2 may give orders.
         follower: Called at every tick; may give orders.
 
     Raises:
@@ -132,11 +148,13 @@ def fly_daemon(
     in_cells = config.mission.cells
     orders = FlightOrders(config, take_off_m=take_off_m, goto=goto, follower=follower, waits_for_fleet=in_cells)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
+    folder, name = find_control_folder(control), make_daemon_name(config)
+    ros2_choice = None if ros2 is None else Ros2Choice(ros2, (folder, name) if ros2_orders else None)
     # The lock comes first: it refuses a second daemon at once.
     with (
         lock_vehicle(config.daemon.vehicle) as vehicle_lock,
-        open_listener(find_control_folder(control), make_daemon_name(config)) as listener,
-        open_viewers(view_port) as viewers,
+        open_listener(folder, name) as listener,
+        open_viewers(view_port, ros2_choice) as viewers,
         create_recording(out, config.name, config.log) as path,
     ):
         with locate_design_errors(loaded):

@@ -6,11 +6,11 @@ import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from traceback import format_exc
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cyclopts import Parameter
 from msgspec.structs import replace
@@ -19,7 +19,7 @@ from logs.recording.ends import count_missing_records, describe_ending, find_mis
 from logs.recording.flight import FlightData
 from logs.recording.missed_ticks import describe_missed_ticks
 from logs.recording.reader import read
-from logs.recording.recorder import DerivedTopics, RecorderStatus
+from logs.recording.recorder import DerivedTopics, RecorderStatus, Watcher
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT
@@ -29,6 +29,9 @@ from uavctl.daemon.flight_orders import make_goto_keys
 from uavctl.errors import ConnectionClosedError, TickOverdueError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, Ending, Order
+
+if TYPE_CHECKING:
+    from logs.live.feed_process import FeedProcess
 
 
 def make_goto_overrides(goto: str | None) -> tuple[str, ...]:
@@ -109,28 +112,54 @@ def choose_live_port(*, live: bool, port: int | None) -> int | None:
     return (LIVE_PORT if port is None else port) if live else None
 
 
+class Ros2Choice(NamedTuple):
+    """What `--ros2` asks for."""
+
+    namespace: str
+    control: tuple[Path, str] | None = None  # folder and name of the daemon that gets orders; None: none are taken
+
+
 @contextmanager
-def open_viewers(live_port: int | None = None) -> Iterator[DerivedTopics]:
-    """Open the viewers of a flight: views in its recording and, with a port, a live view in a process of its own.
+def open_viewers(live_port: int | None = None, ros2: Ros2Choice | None = None) -> Iterator[DerivedTopics]:
+    """Open the viewers of a flight: views in its recording, a live view and a node of ROS 2 in processes of their own.
 
     Args:
         live_port: TCP port of the live view; 0: any free one; None: no live view.
+        ros2: Node of ROS 2; None: no node.
 
     Raises:
-        UsageError: The live view cannot be opened.
+        UsageError: The live view or the node cannot be opened.
     """
-    if live_port is None:
-        yield DerivedTopics(ViewBuilder())
-        return
-    from logs.live.process import LiveProcess  # loaded only for a live view
+    with ExitStack() as stack:
+        processes: list[FeedProcess] = []
+        if live_port is not None:
+            from logs.live.process import LiveProcess  # loaded only for a live view
 
-    live = LiveProcess(live_port, report_dead_view)
-    try:
-        print_message(f"live page: http://localhost:{live.port}/")
-        print_message(f'for Foxglove: ws://localhost:{live.port}/{live.token} ("Open connection")')
-        yield DerivedTopics(ViewBuilder(), live.send)
-    finally:
-        live.close()
+            live = LiveProcess(live_port, report_dead_view)
+            stack.callback(live.close)
+            processes.append(live)
+            print_message(f"live page: http://localhost:{live.port}/")
+            print_message(f'for Foxglove: ws://localhost:{live.port}/{live.token} ("Open connection")')
+        if ros2 is not None:
+            from uavctl.cli.ros2_process import Ros2Process  # loaded only for a node
+
+            node = Ros2Process(*ros2, report_dead_node)
+            stack.callback(node.close)
+            processes.append(node)
+            print_message(f"ROS 2: /{ros2.namespace}/pose, plan, limits and /diagnostics")
+        yield DerivedTopics(ViewBuilder(), _join_watchers(processes))
+
+
+def _join_watchers(processes: Sequence[FeedProcess]) -> Watcher | None:
+    """Return the function that gives each message to all processes; None without any."""
+    if len(processes) < 2:
+        return processes[0].send if processes else None
+
+    def send(topic: str, at_ns: int, data: bytes) -> None:
+        for process in processes:
+            process.send(topic, at_ns, data)
+
+    return send
 
 
 def print_warning(text: str) -> None:
@@ -141,6 +170,11 @@ def print_warning(text: str) -> None:
 def report_dead_view(reason: str) -> None:
     """Print that the process of a live view has ended, and the effect."""
     print_message(label_text("warning", f"the live view has ended: {reason}; the flight goes on"))
+
+
+def report_dead_node(reason: str) -> None:
+    """Print that the process of a node of ROS 2 has ended, and the effect."""
+    print_message(label_text("warning", f"the node of ROS 2 has ended: {reason}; the flight goes on"))
 
 
 def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:

@@ -6,7 +6,7 @@ Domain, discovery and middleware come from the environment, as for every node (R
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -37,6 +37,34 @@ class Ros2Node:
         """
         self._node.create_subscription(import_type(kind), topic, receive, self._sensor_qos)
 
+    def advertise(self, kind: str, topic: str, *, is_latched: bool = False) -> Callable[[Mapping[str, Any]], None]:
+        """Offer a topic; return the function that publishes a message by its fields.
+
+        Args:
+            is_latched: Whether who subscribes later gets the newest message.
+        """
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        message_type = import_type(kind)
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE
+        publisher = self._node.create_publisher(message_type, topic, QoSProfile(depth=1, durability=durability))
+        return lambda fields: publisher.publish(make_message(message_type, fields))
+
+    def serve_trigger(self, kind: str, name: str, act: Callable[[], tuple[bool, str]]) -> None:
+        """Offer a service without arguments.
+
+        Args:
+            kind: `std_srvs/srv/Trigger`.
+            act: Returns success, and text for the caller.
+        """
+
+        def answer(request: Any, response: Any) -> Any:
+            del request
+            response.success, response.message = act()
+            return response
+
+        self._node.create_service(import_type(kind), name, answer)
+
     def list_publishers(self, topic: str) -> list[tuple[str, str]]:
         """Return the node and the type of each publisher of a topic."""
         return [
@@ -52,6 +80,28 @@ def import_type(name: str) -> Any:
     """Import the type of a message or a service, as `geometry_msgs/msg/PoseStamped`."""
     package, folder, kind = name.split("/")
     return getattr(import_module(f"{package}.{folder}"), kind)
+
+
+def make_message(kind: Any, fields: Mapping[str, Any]) -> Any:
+    """Make a message of a mapping of its fields; others keep their defaults.
+
+    Args:
+        kind: Class of the message.
+    """
+    message = kind()
+    for name, value in fields.items():
+        current = getattr(message, name)
+        if isinstance(value, Mapping):
+            value = make_message(type(current), value)
+        elif isinstance(current, bytes):  # the type `byte` of ROS
+            value = bytes([value])
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            package, _, part = (
+                kind.get_fields_and_field_types()[name].removeprefix("sequence<").rstrip(">").partition("/")
+            )
+            value = [make_message(import_type(f"{package}/msg/{part}"), entry) for entry in value]
+        setattr(message, name, value)
+    return message
 
 
 @contextmanager
