@@ -4,7 +4,8 @@ An MCAP has no agreed name for such a topic, nor for its encoding, so the bytes 
 
 1. `mcap_records` yields the messages of each channel.
 2. `mavros` unwraps messages in which ROS wraps one frame each.
-3. `cut_stream` cuts the bytes of a channel into frames, wherever its messages began.
+3. `ros_poses` makes frames of ROS's poses, where nothing holds MAVLink or their topic is asked for.
+4. `cut_stream` cuts the bytes of a channel into frames, wherever its messages began.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from mcap.records import Channel, Schema
 from logs.recording.budget import ExcessError, ReadBudget
 from logs.recording.file_kind import MAGIC, FileKind, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, make_flight
-from logs.recording.mavros import DEFINITION_RATIO, UnreadableError, Unwrapper, make_unwrapper
+from logs.recording.mavros import DEFINITION_RATIO, Definitions, UnreadableError, Unwrapper, make_unwrapper
 from logs.recording.mcap_records import DAMAGE_ERRORS, ChannelMessage, TornError, read_records
+from logs.recording.ros_poses import STATE_BYTES, PoseUnwrapper, parse_pose_type
 from logs.recording.summary import count
 from logs.recording.tlog import (
     MARKERS,
@@ -107,7 +109,7 @@ class _ChannelStream(msgspec.Struct, gc=False):
         topic: Topic of the channel.
         encoding: Encoding of its messages.
         kind: Name of their schema; empty if they have none.
-        unwrap: Makes a frame of each message, if they are MAVLink wrapped by ROS.
+        unwrap: Makes a frame of each message, if they are MAVLink wrapped by ROS, or poses.
         is_requested: It was asked for, so it is read however little MAVLink is in it.
         budget: Bounds the kept bytes.
         messages: Number of messages so far.
@@ -121,7 +123,7 @@ class _ChannelStream(msgspec.Struct, gc=False):
     topic: str
     encoding: str
     kind: str
-    unwrap: Unwrapper | None
+    unwrap: Unwrapper | PoseUnwrapper | None
     is_requested: bool
     budget: ReadBudget
     messages: int = 0
@@ -151,6 +153,11 @@ class _ChannelStream(msgspec.Struct, gc=False):
         self.pieces.append((at_ns, data))
         if self.probe is not None:
             self._probe_frames(self.probe, data)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether its frames are made of poses."""
+        return isinstance(self.unwrap, PoseUnwrapper)
 
     def make_packets(self) -> tuple[tuple[TlogPacket, ...], tuple[str, ...]]:
         """Return the channel's packets, none if it holds no MAVLink, and remarks on it.
@@ -223,13 +230,15 @@ def is_foreign(path: Path) -> bool:
 def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
     """Read all MAVLink packets of an MCAP: raw frames, cut into messages anywhere, or wrapped by ROS one by one.
 
+    Poses of ROS are packets too, where their topic is named, or it is the only one and nothing is MAVLink.
+
     Args:
         path: The file; chunks may be stored, or packed with lz4 or zstd.
         topics: The topics to take; those that hold MAVLink if none is named.
 
     Raises:
         RecordingError: Damaged, nothing in it is MAVLink (the message lists what is), or it has no times.
-        UsageError: There is no such topic.
+        UsageError: There is no such topic, or poses are of several topics.
     """
     streams: dict[int, _ChannelStream] = {}
     try:
@@ -247,17 +256,29 @@ def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
     packets: list[TlogPacket] = []
     used_topics: list[str] = []
     notes: list[str] = []
-    for stream in streams.values():
-        if topics and stream.topic not in topics:
-            continue
-        stream_packets, stream_notes = stream.make_packets()
-        packets += stream_packets
-        used_topics += [stream.topic] if stream_packets else []
-        notes += stream_notes
+    chosen = [stream for stream in streams.values() if not topics or stream.topic in topics]
+    for has_poses in (False, True):
+        group = [stream for stream in chosen if stream.has_poses is has_poses]
+        if has_poses and used_topics and not topics:
+            break
+        if has_poses:
+            _check_pose_topics(path, group)
+        for stream in group:
+            stream_packets, stream_notes = stream.make_packets()
+            packets += stream_packets
+            used_topics += [stream.topic] if stream_packets else []
+            notes += stream_notes
     if not used_topics:
         listed = _format_names(sorted(stream.describe() for stream in streams.values()))
         raise RecordingError("; ".join([f"{path}: no raw MAVLink in it", listed, *notes]))
     return ForeignMcap(sort_packets(packets), tuple(dict.fromkeys(used_topics)), torn, tuple(notes))
+
+
+def _check_pose_topics(path: Path, streams: list[_ChannelStream]) -> None:
+    """Refuse poses of several topics, which may be several bodies."""
+    names = sorted({stream.topic for stream in streams if stream.pieces})
+    if len(names) > 1:
+        raise UsageError(f"{path}: poses of several topics; choose one with --topic: {', '.join(names)}")
 
 
 def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
@@ -270,6 +291,7 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
     schemas: dict[int, tuple[str, str, bytes]] = {}
     # By the content of a schema, and the encoding of messages: a recorder may repeat a schema for each topic.
     unwrappers: dict[tuple[str, str, bytes, str], Unwrapper | None] = {}
+    pose_types: dict[tuple[str, str, bytes, str], Definitions | None] = {}
     budget = ReadBudget(size)
     try:
         for record in read_records(file, size, budget):
@@ -291,13 +313,19 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
                     unwrappers[key] = None
                 elif key not in unwrappers:
                     unwrappers[key] = make_unwrapper(record.message_encoding, schema_encoding, name, definition)
-                    if unwrappers[key] is not None:
+                    pose_types[key] = parse_pose_type(record.message_encoding, schema_encoding, name, definition)
+                    if unwrappers[key] is not None or pose_types[key] is not None:
                         budget.keep(DEFINITION_RATIO * len(definition))
+                unwrap: Unwrapper | PoseUnwrapper | None = unwrappers[key]
+                types = pose_types.get(key)
+                if types is not None:
+                    budget.keep(STATE_BYTES)
+                    unwrap = PoseUnwrapper(types, name, record.message_encoding, record.topic)
                 streams[record.id] = _ChannelStream(
                     topic=record.topic,
                     encoding=record.message_encoding,
                     kind=name,
-                    unwrap=unwrappers[key],
+                    unwrap=unwrap,
                     is_requested=record.topic in topics,
                     budget=budget,
                 )

@@ -15,7 +15,7 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ROS1, ROS2 = "ros1", "cdr"  # encodings of messages
-_DEFINITIONS = {ROS1: "ros1msg", ROS2: "ros2msg"}  # and of their schemas
+DEFINITION_ENCODINGS = {ROS1: "ros1msg", ROS2: "ros2msg"}  # and of their schemas
 _NUMBER_FORMATS = {
     "bool": "B",
     "byte": "B",
@@ -43,7 +43,7 @@ _MAX_ALIGNMENTS = {0: 8, 1: 8, 6: 4, 7: 4}
 # Of a message that wraps a frame, at most: a frame has 280 bytes, mavros_msgs/Mavlink 16 fields.
 _MAX_WRAPPED_BYTES, _MAX_STEPS = 4096, 256
 _MAX_DEPTH = 64  # of types within types
-_MAX_DEFINITION_BYTES = 2**16  # of such a message; that of mavros_msgs/Mavlink has 3000
+MAX_DEFINITION_BYTES = 2**16  # of such a message; that of mavros_msgs/Mavlink has 3000
 DEFINITION_RATIO = 64  # bytes of memory for each byte of a definition that was parsed
 _MAVLINK_FIELDS = frozenset(("magic", "len", "seq", "sysid", "compid", "msgid", "checksum", "payload64"))
 
@@ -80,7 +80,7 @@ class Unwrapper(msgspec.Struct, frozen=True, gc=False):
         Raises:
             UnreadableError: The message is damaged.
         """
-        return _make_frame(_RosReader(data, self.types, self.encoding).read_record(self.top))
+        return _make_frame(RosReader(data, self.types, self.encoding).read_record(self.top))
 
 
 class UnreadableError(Exception):
@@ -95,13 +95,13 @@ def make_unwrapper(encoding: str, schema_encoding: str, name: str, definition: b
     Returns:
         None if they are something else.
     """
-    if _DEFINITIONS.get(encoding) != schema_encoding or len(definition) > _MAX_DEFINITION_BYTES:
+    if DEFINITION_ENCODINGS.get(encoding) != schema_encoding or len(definition) > MAX_DEFINITION_BYTES:
         return None
     if not all(field.encode() in definition for field in _MAVLINK_FIELDS):
         return None
-    top = _normalise_type_name(name)
+    top = normalise_type_name(name)
     try:
-        types = _parse_definition(top, definition.decode("utf-8", errors="replace"))
+        types = parse_definition(top, definition.decode("utf-8", errors="replace"))
     except UnreadableError:
         return None
     if not _MAVLINK_FIELDS.issubset(field.name for field in types[top]):
@@ -110,12 +110,12 @@ def make_unwrapper(encoding: str, schema_encoding: str, name: str, definition: b
     return Unwrapper(types, top, encoding)
 
 
-def _normalise_type_name(name: str) -> str:
+def normalise_type_name(name: str) -> str:
     """Return a type's name as ROS 1 has it: without `msg` between package and type."""
     return name.replace("/msg/", "/")
 
 
-def _parse_definition(top: str, text: str) -> Definitions:
+def parse_definition(top: str, text: str) -> Definitions:
     """Return the fields of all types in a ROS message definition, without constants and comments."""
     types: Definitions = {}
     for number, part in enumerate(_SEPARATOR.split(text)):
@@ -125,7 +125,7 @@ def _parse_definition(top: str, text: str) -> Definitions:
         if number:
             if not lines or not lines[0].startswith("MSG:"):
                 raise UnreadableError("a definition without its name")
-            owner = _normalise_type_name(lines.pop(0).removeprefix("MSG:").strip())
+            owner = normalise_type_name(lines.pop(0).removeprefix("MSG:").strip())
         types[owner] = tuple([field for line in lines if (field := _parse_field(line, owner)) is not None])
     return types
 
@@ -137,7 +137,7 @@ def _parse_field(line: str, owner: str) -> _RosField | None:
         raise UnreadableError(f"cannot make sense of {line!r}")
     if match["rest"].lstrip().startswith("="):
         return None
-    kind = _normalise_type_name(match["type"])
+    kind = normalise_type_name(match["type"])
     if kind == "Header":
         kind = "std_msgs/Header"
     elif "/" not in kind and kind not in (*_NUMBER_FORMATS, *_TIME_FORMATS, "string", "wstring"):
@@ -146,7 +146,7 @@ def _parse_field(line: str, owner: str) -> _RosField | None:
     return _RosField(kind, match["name"], size if match["array"] else None)
 
 
-class _RosReader:
+class RosReader:
     """Reader of one serialised ROS message.
 
     A definition may nest types that have no bytes, or lists of them: the steps of reading are bounded.
