@@ -314,9 +314,9 @@ def test_without_a_position_the_hint_is_of_who_should_have_sent_it() -> None:
     assert "track the body of natnet://" in hints[1] and "VISION_POSITION_ESTIMATE" not in hints[1]
 
 
-def told_by_motive(*place: float) -> Preflight:
+def told_by_motive(*place: float, mocap: str = MOTIVE) -> Preflight:
     """Motive's metres, sent with the axes of another up."""
-    flight, peer = Preflight(load_config("room-hahn-stursberg", [MOTIVE]), make_links, 0), Peer(246, 197)
+    flight, peer = Preflight(load_config("room-hahn-stursberg", [mocap]), make_links, 0), Peer(246, 197)
     level = (
         20,
         12,
@@ -340,6 +340,12 @@ def test_a_body_of_motive_s_out_of_the_room_is_a_matter_of_its_up_axis_not_of_un
     assert place.state is ItemState.BAD and "?up=z" in place.hint and "frame.convention" not in place.hint
     place = {one.name: one for one in told_by_motive(50.0, 20.0, -90.0).make_items(3 * S)}["position in the room"]
     assert place.state is ItemState.BAD and "metres" not in place.hint
+
+
+def test_a_body_of_a_topic_out_of_the_room_is_a_matter_of_its_driver_s_axes_and_unit() -> None:
+    flight = told_by_motive(0.1, 0.2, 1.2, mocap="daemon.mocap=ros2://drone/pose")
+    place = {one.name: one for one in flight.make_items(3 * S)}["position in the room"]
+    assert place.state is ItemState.BAD and "metres" in place.hint and "?up=" not in place.hint
 
 
 # --- what forbids arming ---------------------------------------------------------------------------------------------

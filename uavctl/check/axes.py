@@ -19,7 +19,7 @@ from uavctl.check.axis_fit import (
 )
 from uavctl.check.check_data import AIDED, HORIZONTAL, CheckData
 from uavctl.check.findings import Item, ItemState, make_item
-from uavctl.check.positions import CAMERA_AXES, estimate_noise_m, measure_extent_m, uses_camera_system
+from uavctl.check.positions import describe_camera_axes, estimate_noise_m, measure_extent_m, uses_camera_system
 from uavctl.config.types import Config
 from uavctl.frames import Quaternion, euler_from_quaternion, multiply_quaternions, quaternion_from_euler
 from uavctl.records import Vec3
@@ -170,7 +170,7 @@ def _format_vector(vector: Array) -> str:
 def _make_hint(evidence: list[Evidence], config: Config) -> str:
     hint = "see [frame] (convention, origin_m, yaw_deg), and the unit and handedness of the source's positions"
     if uses_camera_system(config):
-        hint = CAMERA_AXES
+        hint = describe_camera_axes(config)
     is_only_rest = len(evidence) == 1 and config.check.same_origin
     return hint + (
         "; does the vehicle count from another origin? Then check.same_origin = false" if is_only_rest else ""

@@ -28,8 +28,11 @@ _NOISE_FACTOR = 2.0
 _FROZEN_SAMPLES = 20  # in a row: noise repeats one less than twice, a lost body repeats for as long as it is lost
 _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres"))
 # A camera system that is listened to without a bridge has its own settings for axes, and its unit is known.
-CAMERA_AXES = (
+_CAMERA_AXES = (
     "does Motive stream Z up? Then the URL of daemon.mocap needs ?up=z, else not; see [frame] (origin_m, yaw_deg)"
+)
+_ROS2_AXES = (
+    "does the driver publish metres, in axes east, north, up? See docs/ros2.md, and [frame] (origin_m, yaw_deg)"
 )
 
 
@@ -69,6 +72,16 @@ def _report_no_positions(data: CheckData, config: Config) -> Item:
 def uses_camera_system(config: Config) -> bool:
     """Return whether the positions come from a camera system without a bridge."""
     return bool(parse_camera_scheme(config.daemon.mocap))
+
+
+def _uses_ros2(config: Config) -> bool:
+    """Return whether the positions come from a topic, whose unit and axes are its driver's."""
+    return parse_camera_scheme(config.daemon.mocap) == "ros2"
+
+
+def describe_camera_axes(config: Config) -> str:
+    """Return a hint on the axes of positions that come without a bridge."""
+    return _ROS2_AXES if _uses_ros2(config) else _CAMERA_AXES
 
 
 def _estimate_period_s(captured_s: list[float]) -> float | None:
@@ -208,7 +221,7 @@ def _check_noise(samples: list[Sample], config: Config) -> Item:
     if float((high - low).max()) > max(10.0 * noise_m, config.check.move_m):
         return make_item("position noise", ItemState.UNDETERMINED, f"{value}, but the body moved", want, "let it rest")
     hint = "check the cameras' calibration, or raise estimator.position_std_m"
-    for scale, unit in () if uses_camera_system(config) else _UNITS:
+    for scale, unit in () if uses_camera_system(config) and not _uses_ros2(config) else _UNITS:
         if (
             configured_m * _NOISE_FACTOR < noise_m <= configured_m * scale * _NOISE_FACTOR
             and noise_m > 10 * configured_m
@@ -227,7 +240,7 @@ def _check_room(samples: list[Sample], config: Config) -> Item:
     is_inside = _is_inside(middle.tolist(), limits, config.check.margin_m)
     hint = "see [frame] (axes, origin, unit), or the limits of [sets]"
     if uses_camera_system(config):
-        hint = f"{CAMERA_AXES}, or the limits of [sets]"
+        hint = f"{describe_camera_axes(config)}, or the limits of [sets]"
     elif not is_inside:
         for scale, unit in _UNITS if _is_far_outside(middle.tolist(), limits) else ():
             if _is_inside((middle / scale).tolist(), limits, config.check.margin_m):
