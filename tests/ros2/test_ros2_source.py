@@ -13,9 +13,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 from nav_msgs.msg import Odometry
 from node_rig import make_node, published
 from patience import LIMIT_S, wait_until
+from rclpy.duration import Duration
 from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 
+from uavctl.config import load_config
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.base import Connection
 from uavctl.io.ros2_host import NO_PUBLISHER
@@ -23,6 +25,7 @@ from uavctl.io.sources import open_source
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.messages import Position, TimeSync
+from uavctl.mavlink.positions import PositionDecoder
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")  # of a parser that rclpy imports
 TOPIC = "/drone/pose"
@@ -103,6 +106,32 @@ def test_the_system_s_time_is_answered_where_the_stamps_are_of_it(node: Any) -> 
         begin_ns = time.time_ns()
         answer, _, _ = ask_time(connection)
         assert begin_ns <= answer.tc1_ns <= time.time_ns()
+
+
+def test_the_whole_delay_is_measured_where_the_clock_is_known(node: Any) -> None:
+    """A driver whose stamps are 0.2 s old: without its clock, a constant delay is not seen."""
+    delay = Duration(nanoseconds=200_000_000)
+    config = load_config("room")
+
+    def make() -> Any:
+        return make_message(PoseStamped, (node.get_clock().now() - delay).to_msg())
+
+    with published(node, TOPIC, PoseStamped, make):
+        for url, is_known in (("ros2://drone/pose?clock=system", True), ("ros2://drone/pose", False)):
+            decoder = PositionDecoder(config.frame, config.clock, config.source, config.estimator, lambda _: None)
+            with closing(open_source(url)) as connection:
+                round_trip_ns = 0
+                if is_known:
+                    answer, sent_ns, received_ns = ask_time(connection)
+                    decoder.add_timesync_answer((246, 197), sent_ns, answer.tc1_ns, received_ns)
+                    round_trip_ns = received_ns - sent_ns
+                samples = [decoder.make_sample(*arrived) for arrived in receive(connection, Position, 20)]
+            ages_ns = [sample.received_ns - sample.captured_ns for sample in samples if sample is not None]
+            assert len(ages_ns) >= 10
+            if is_known:
+                assert min(ages_ns) >= delay.nanoseconds - round_trip_ns // 2
+            else:
+                assert min(ages_ns) == pytest.approx(config.clock.latency_s * 1e9, abs=1e3)
 
 
 def test_stamps_of_a_simulation_are_put_into_our_time_by_its_clock(node: Any) -> None:

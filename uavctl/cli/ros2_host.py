@@ -27,13 +27,13 @@ from uavctl.cli.ros2_process import TRIGGER
 from uavctl.daemon.control_socket import ControlRequest, Reply
 from uavctl.errors import RecordingError, UavctlError
 from uavctl.io.camera import CameraError
-from uavctl.io.ros2_node import Ros2Node, open_node
+from uavctl.io.ros2_node import Ros2Node, load_types, open_node
 
 GOTO_KIND = "geometry_msgs/msg/PoseStamped"
 ServiceName = Literal["hold", "land", "resume"]
 SERVICES: tuple[ServiceName, ...] = ("hold", "land", "resume")
 Send = Callable[[ControlRequest], Reply]
-_NICENESS = 19  # the flight and all that it needs come first
+_NICENESS = 10  # the flight comes first; lower, orders would not come through on a busy computer
 _OOM_SCORE = Path("/proc/self/oom_score_adj")
 _POLL_S = 0.1
 
@@ -98,9 +98,10 @@ class FlightNode:
 
     def run(self, feed: socket.socket, on_end: Callable[[], None]) -> None:
         """Publish until the flight has gone."""
+        buffer = bytearray(LARGEST)
         try:
-            while datagram := feed.recv(LARGEST):
-                self.publish_message(datagram)
+            while size := feed.recv_into(buffer):
+                self.publish_message(bytes(memoryview(buffer)[:size]))
         except OSError:
             pass  # the flight has gone
         finally:
@@ -124,6 +125,7 @@ def main(arguments: list[str]) -> int:
     """Publish for the flight that started this process."""
     number, namespace, *control = arguments
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
+    load_types([GOTO_KIND, TRIGGER, *(output.kind for output in OUTPUTS.values())])  # takes seconds at low priority
     os.nice(_NICENESS)
     with suppress(OSError):  # not every container permits it
         _OOM_SCORE.write_text("1000")  # a computer without memory ends this process first

@@ -6,7 +6,7 @@ Domain, discovery and middleware come from the environment, as for every node (R
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -80,6 +80,14 @@ def import_type(name: str) -> Any:
     """Import the type of a message or a service, as `geometry_msgs/msg/PoseStamped`."""
     package, folder, kind = name.split("/")
     return getattr(import_module(f"{package}.{folder}"), kind)
+
+
+def load_types(names: Iterable[str]) -> None:
+    """Import types of messages and services with all that a node needs of them."""
+    from rclpy.type_support import check_for_type_support
+
+    for name in names:
+        check_for_type_support(import_type(name))
 
 
 def make_message(kind: Any, fields: Mapping[str, Any]) -> Any:
