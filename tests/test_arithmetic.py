@@ -83,7 +83,10 @@ def computed(first: str) -> tuple[str, bool, list[str]]:
     return arithmetic, wide, bits
 
 
-@pytest.mark.parametrize("first", ["uavctl", "logs.recording.topics", "sim.vehicle"])
+@pytest.mark.parametrize(
+    "first",
+    ["uavctl", *(pytest.param(name, marks=pytest.mark.slow) for name in ("logs.recording.topics", "sim.vehicle"))],
+)
 def test_the_last_bits_are_those_of_other_makers(first: str) -> None:
     arithmetic, wide, bits = computed(f"import {first}")
     own, _, others = computed("import numpy")

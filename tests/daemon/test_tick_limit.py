@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from uavctl.daemon import tick_limit
 from uavctl.daemon.tick_limit import ENGAGED_LIMIT_S, LIMIT_S, TickLimit, limit_ticks
 from uavctl.errors import TickOverdueError
 
@@ -30,6 +31,13 @@ def catch_errors_for_ever() -> None:
             continue
 
 
+@pytest.fixture
+def _short_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fifth of the real time; how long the limits are is counted below."""
+    monkeypatch.setattr(tick_limit, "LIMIT_S", 0.2)
+
+
+@pytest.mark.usefixtures("_short_limit")
 @pytest.mark.fault(102)
 @pytest.mark.parametrize("run", [loop_for_ever, sleep_for_ever, catch_errors_for_ever])
 def test_102_a_tick_without_an_end_is_interrupted(run: Callable[[], None]) -> None:
@@ -37,6 +45,7 @@ def test_102_a_tick_without_an_end_is_interrupted(run: Callable[[], None]) -> No
         run()
 
 
+@pytest.mark.usefixtures("_short_limit")
 @pytest.mark.fault(102)
 def test_102_an_error_that_is_swallowed_comes_again() -> None:
     caught = []

@@ -122,6 +122,7 @@ def test_bursts_are_observed(flight: tuple[list[StepInput], list[TickOutput]]) -
     assert 0.75 <= float(np.median(continuations)) <= 0.92
 
 
+@pytest.mark.slow
 def test_the_certificate_keeps_further_from_the_wall_in_silence_than_the_configured_link() -> None:
     """The oldest stages of the plans have no back-off where the configured link calls their ages rare."""
 

@@ -143,6 +143,7 @@ def test_vehicles_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*.mcap")) == []
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_hovers_below_another_one_is_pushed_down_and_holds(tmp_path: Path) -> None:
     places: list[Vec3] = [(0.0, 0.0, -1.6), (0.0, 0.0, -1.2)]
 

@@ -85,7 +85,7 @@ def solve_two_vehicles(first: Array, second: Array, loss: float) -> float:
     return mean
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.3])
+@pytest.mark.parametrize("loss", [0.3, pytest.param(0.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("first", "second"), [((0.5, 0.0), (0.1, 0.0)), ((0.2, 0.0), (0.2, 5.0)), ((0.2, 0.0),) * 2])
 def test_value_costs_at_most_5_percent_more_than_dynamic_programming(
     first: tuple[float, float], second: tuple[float, float], loss: float

@@ -63,6 +63,7 @@ def test_a_share_of_nothing_is_refused(hits: int, trials: int) -> None:
         clopper_pearson(hits, trials)
 
 
+@pytest.mark.slow
 def test_the_bootstrap_covers_the_mean_of_skewed_costs_about_as_often_as_it_says() -> None:
     rng = np.random.default_rng(11)
     trials = 400

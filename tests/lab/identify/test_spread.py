@@ -99,6 +99,7 @@ def test_the_spread_is_one_where_the_model_made_the_flight() -> None:
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(spreads), axis=0)), 1.0, atol=3.0 * 0.037)
 
 
+@pytest.mark.slow
 def test_first_order_gusts_spread_further_than_white_noise_and_as_a_drift_states() -> None:
     rng = np.random.default_rng(3)
     flown = [make_stretch(rng, draw_gusts(rng, 1.0, GUST_MPS2, 1200)) for _ in range(4)]

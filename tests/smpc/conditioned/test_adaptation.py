@@ -76,7 +76,13 @@ def test_a_record_begins_with_the_certificate(shares: Array) -> None:
     assert record_ages(draw_ages(adaptation.REVIEW_STEPS - 1, LOSS, 1.0, 1), shares).level == CERTIFICATE_LEVEL
 
 
-@pytest.mark.parametrize(("loss", "burst"), [(0.1, 1.0), (0.3, 1.0), (0.3, 3.0), (0.6, 1.0), (0.6, 5.0), (0.8, 10.0)])
+@pytest.mark.parametrize(
+    ("loss", "burst"),
+    [
+        *[(0.1, 1.0), (0.3, 3.0), (0.8, 10.0)],
+        *(pytest.param(*link, marks=pytest.mark.slow) for link in [(0.3, 1.0), (0.6, 1.0), (0.6, 5.0)]),
+    ],
+)
 def test_bounds_of_a_long_record_are_above_the_link_and_near_it(shares: Array, loss: float, burst: float) -> None:
     first_loss = loss if burst == 1.0 else loss / (burst * (1.0 - loss))
     continuation = loss if burst == 1.0 else 1.0 - 1.0 / burst

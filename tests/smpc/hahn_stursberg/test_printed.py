@@ -30,6 +30,7 @@ def solver(design: Design) -> PrintedSolver:
     return PrintedSolver(design)
 
 
+@pytest.mark.slow
 def test_cost_of_each_axis(design: Design) -> None:
     north, east = (PrintedProblem(design, component).solve(START, ORIGIN) for component in decompose(design))
     assert [north.cost, east.cost] == pytest.approx([PAPER_COST_X, PAPER_COST_Y], rel=1e-6)

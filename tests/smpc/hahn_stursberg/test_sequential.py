@@ -155,7 +155,7 @@ def exact_answers() -> tuple[Answer, ...]:
 @pytest.mark.parametrize(
     ("constant", "value"),
     [
-        pytest.param("_NULL_EIGENVALUE", 1e-30, id="without the terminal condition"),
+        pytest.param("_NULL_EIGENVALUE", 1e-30, id="without the terminal condition", marks=pytest.mark.slow),
         pytest.param("_NULL_EIGENVALUE", 0.5, id="a terminal condition of too low a rank"),
         pytest.param("_MAX_ROUNDS", 1, id="a single round"),
         pytest.param("_MAX_ROUNDS", 3, id="too few rounds"),
@@ -187,6 +187,7 @@ def test_the_optimum_of_another_cost_has_no_proof(monkeypatch: pytest.MonkeyPatc
     assert all(solver("paper").solve(0, x, design.target).method != "sequential" for x in states)
 
 
+@pytest.mark.slow
 def test_where_slack_is_cheaper_than_a_detour_the_exact_program_answers() -> None:
     design, rng, methods = replace(design_of("paper"), slack_linear=5.0), np.random.default_rng(107), Counter[str]()
     tested, exact = ShortcutSolver(design, sequential=True), ConicSolver(design)
