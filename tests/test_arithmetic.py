@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from places import without_pages
 
 from uavctl.arithmetic import CHOICE, OWN, PORTABLE, choose_arithmetic, without_choice
 
@@ -104,7 +105,9 @@ def test_a_flight_is_replayed_with_the_arithmetic_that_it_was_made_with_or_to_a_
 
     def told(environ: dict[str, str], *words: str) -> tuple[dict[str, object], bytes]:
         command = [sys.executable, "-m", "uavctl", *words, "--json"]
-        made = subprocess.run(command, env=environ, capture_output=True, check=True, timeout=120, cwd=tmp_path)
+        made = subprocess.run(
+            command, env=without_pages(environ), capture_output=True, check=True, timeout=120, cwd=tmp_path
+        )
         return json.loads(made.stdout), made.stderr
 
     for name, environ in (("own", own), ("portable", portable)):

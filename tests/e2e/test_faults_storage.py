@@ -12,7 +12,7 @@ import pytest
 from flip_rig import FlipTest
 from loopback_rig import MemorySink, header, make_loop
 from mcap.reader import make_reader
-from places import ROOT
+from places import ROOT, without_pages
 from recording_fakes import Clock, Disk, Item, drop_recorder_notes, flight, record_flight, stored_byte
 
 from logs.recording.disk import DiskFile, OutputFile
@@ -211,6 +211,7 @@ def test_31_killed_processes_lose_the_open_chunk_at_most() -> None:
 def test_what_is_left_of_a_flight_replays_alike(scenario: str, runs: int) -> None:
     done = subprocess.run(
         [sys.executable, TOOL, "--scenario", scenario, "--runs", str(runs), "--json"],
+        env=without_pages(),
         capture_output=True,
         text=True,
         check=False,
