@@ -254,6 +254,9 @@ def test_the_radio_of_the_page_sends_to_four_vehicles(shell: ManualShell) -> Non
     (cameras,) = find_commands("docs/fleet.md", "One radio")
     shell.wait_for_text(shell.start(f"{sim} {LONG_TIMEOUT}"), "system_id 4")
     shell.run(f"{cameras} --duration 3")
+    check, cameras_in_cells, _ = find_commands("docs/fleet.md", "One room")
+    shell.run(check)
+    shell.run(f"{cameras_in_cells} --duration 3")
 
 
 @pytest.mark.manual

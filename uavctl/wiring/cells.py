@@ -164,7 +164,8 @@ class Coordinator:
 
     def is_at_rest(self, max_speed_mps: float) -> bool:
         """Whether no vehicle that flies by plans is faster than a speed."""
-        flown = [report for report in self._newest.values() if report.conduct in (Conduct.CELL, Conduct.REST)]
+        reports = list(self._newest.values())  # another thread may add one meanwhile
+        flown = [report for report in reports if report.conduct in (Conduct.CELL, Conduct.REST)]
         return all(float(np.linalg.norm(report.velocity_mps)) <= max_speed_mps for report in flown)
 
     def receive(self, number: int, message: CellReport) -> None:

@@ -1,0 +1,149 @@
+"""Two 6-DOF vehicles that exchange places in cells, through the daemons' control sockets, in virtual time."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from logs.recording.reader import read_kind
+from uavctl.arrays import Array
+from uavctl.config import load_config
+from uavctl.daemon.cell_exchange import CellExchange, ExchangedVehicle
+from uavctl.daemon.control_socket import ControlServer, open_listener
+from uavctl.daemon.flight_orders import FlightOrders
+from uavctl.daemon.health import Health
+from uavctl.lab.lockstep import LockstepFleet
+from uavctl.loop import ControlLoop
+from uavctl.records import FleetTruth, Ticked
+from uavctl.wiring.cells import Coordinator, build_cell_parameters
+from uavctl.wiring.controller import build_flight_design, prepare
+
+STARTS_M = ((-1.2, 0.1, -0.2), (1.2, -0.1, -0.2))
+GOALS_M = np.array([[1.2, 0.0, -1.2], [-1.2, 0.0, -1.2]])
+DISTANCE_M = 0.35
+FLOWN_S, CROSSING_S = 16.0, 7.6  # they take off at 0.3 s, fly by plans from 6 s on, and pass each other at about 8 s
+STEP_S = 0.05
+ROOM = (
+    "limits.accel_mps2=[2,2,1.5]",
+    "sets.input_lower=[-2,-2,-1.5]",
+    "sets.input_upper=[2,2,1.5]",
+    "mission.cells=true",
+    f"duration_s={FLOWN_S}",
+)
+
+
+def refuse_health() -> Health:
+    raise AssertionError
+
+
+class Daemon:
+    """Services of one daemon after each tick of its loop."""
+
+    def __init__(self, orders: FlightOrders, server: ControlServer) -> None:
+        self._orders, self._server = orders, server
+
+    def handle_tick(self, loop: ControlLoop, ticked: Ticked) -> None:
+        self._orders.handle_tick(loop, ticked)
+        self._server.after_tick(ticked, 0)
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as path:  # short: a socket's path has 107 bytes
+        yield Path(path)
+
+
+def fly(folder: Path, stands_still_s: tuple[float, float]) -> tuple[Array, Array, Array]:
+    """Fly while the coordinator stands still for a span; return times, true places (n, 2, 3), and lowest and highest
+    corners of the last boxes in use when the span begins (2, 2, 3)."""
+    configs = [
+        load_config(
+            "room-px4",
+            [
+                *ROOM,
+                f"sim.start_position_m={list(start_m)}",
+                f"mission.waypoints=[{goal_m.tolist()}]",
+                f"sim.system_id={number + 1}",
+                f"sim.seed={number + 70}",
+            ],
+        )
+        for number, (start_m, goal_m) in enumerate(zip(STARTS_M, GOALS_M, strict=True))
+    ]
+    design = build_flight_design(configs[0])
+    fleet = LockstepFleet(
+        [prepare(config, design) for config in configs],
+        [folder / f"v{number}.mcap" for number in range(2)],
+        folder / "world.mcap",
+    )
+    coordinator = Coordinator(build_cell_parameters(configs, DISTANCE_M), 2)
+    boxes: list[Array] = []
+    with ExitStack() as stack:
+        daemons = []
+        for number, (config, loop) in enumerate(zip(configs, fleet.loops, strict=True)):
+            orders = FlightOrders(config, take_off_m=1.2, goto=False, waits_for_fleet=True)
+            orders.begin(loop)
+            listener = stack.enter_context(open_listener(folder, f"v{number}"))
+            server = ControlServer(listener, config, loop, refuse_health, orders.permit_take_off)
+            stack.callback(server.close)
+            daemons.append(Daemon(orders, server))
+        vehicles = [ExchangedVehicle(f"v{number}", folder / f"v{number}.sock") for number in range(2)]
+        exchange = CellExchange(coordinator, vehicles, lambda _: None, pytest.fail)
+        stack.callback(exchange.close)
+
+        def wake(flown_s: float) -> bool:
+            at_s = flown_s - 0.5 * STEP_S  # in the middle of the step
+            if not stands_still_s[0] <= at_s < stands_still_s[1]:
+                exchange.wake(round(at_s * 1e9))
+            elif at_s >= stands_still_s[0] + 0.2 and not boxes:  # nothing is on its way any more
+                assert coordinator.state is not None
+                for loop, new, old in zip(
+                    fleet.loops, coordinator.state.newest, coordinator.state.previous, strict=True
+                ):
+                    report = loop.report_cell()
+                    assert report is not None
+                    cell = new if report.in_use == new.number else old
+                    assert report.in_use == cell.number
+                    boxes.append(np.array([cell.lower_m[-1], cell.upper_m[-1]]))
+            return True
+
+        try:
+            fleet.fly(wake, observers=daemons, landing_s=10.0)
+        finally:
+            fleet.close()
+    assert not fleet.collisions
+    truths = list(read_kind(folder / "world.mcap", FleetTruth))
+    places_m = np.array([[vehicle.position_m for vehicle in truth.vehicles] for truth in truths])
+    return np.array([truth.at_ns * 1e-9 for truth in truths]), places_m, np.array(boxes)
+
+
+def assert_apart(places_m: Array) -> None:
+    """Assert that vehicles in the air are apart: in flight by plans, and as they land."""
+    offset_m = places_m[:, 0] - places_m[:, 1]
+    apart = np.maximum(np.hypot(offset_m[:, 0], offset_m[:, 1]), np.abs(offset_m[:, 2]) / 3.0)
+    assert apart.min() >= DISTANCE_M
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("span_s", [(FLOWN_S, FLOWN_S), (CROSSING_S, CROSSING_S + 3.0)], ids=["runs", "stands still"])
+def test_vehicles_take_off_together_exchange_their_places_and_land(folder: Path, span_s: tuple[float, float]) -> None:
+    times_s, places_m, boxes_m = fly(folder, span_s)
+    assert_apart(places_m)
+    at_end = int(np.searchsorted(times_s, FLOWN_S - STEP_S))
+    assert (np.linalg.norm(places_m[at_end] - GOALS_M, axis=1) < 0.25).all()
+    assert (places_m[-1, :, 2] > -0.1).all()  # on the floor
+    if len(boxes_m):  # they rest in the boxes that hold for good, also in truth
+        at_rest = int(np.searchsorted(times_s, span_s[1]))
+        assert (places_m[at_rest] >= boxes_m[:, 0]).all() and (places_m[at_rest] <= boxes_m[:, 1]).all()
+
+
+@pytest.mark.slow
+def test_without_a_coordinator_all_hold_in_their_last_boxes(folder: Path) -> None:
+    times_s, places_m, boxes_m = fly(folder, (CROSSING_S, FLOWN_S + 100.0))
+    assert_apart(places_m)
+    resting = (times_s > CROSSING_S + 3.0) & (times_s < FLOWN_S - STEP_S)
+    assert (places_m[resting] >= boxes_m[:, 0]).all() and (places_m[resting] <= boxes_m[:, 1]).all()
