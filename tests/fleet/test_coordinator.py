@@ -7,7 +7,7 @@ import pytest
 
 from uavctl.fleet.boxes import Boxes, find_gaps
 from uavctl.fleet.cell import CellChoice, MovingCell, PlannedPath, Report, decide_cell
-from uavctl.fleet.coordinator import CellParameters, advance, begin, issue, receive
+from uavctl.fleet.coordinator import CellParameters, advance, begin, begin_without_cells, issue, receive
 from uavctl.fleet.voronoi import make_voronoi_cells
 from uavctl.records import Conduct
 
@@ -203,3 +203,13 @@ def test_buffered_voronoi_cells_contain_their_vehicles_and_are_apart() -> None:
     assert (boxes.lower_m[:, 0] <= STARTS_M[:4]).all()
     assert (boxes.upper_m[:, 0] >= STARTS_M[:4]).all()
     assert find_gaps(boxes, boxes, PARAMETERS.distance_m)[np.triu_indices(4, 1)].min() >= 1.0 - 1e-9
+
+
+@pytest.mark.parametrize(("margin_m", "room_m"), [(0.3, 0.3), (2.0, PARAMETERS.max_margin_m)])
+def test_a_cell_has_room_for_margins_up_to_a_limit(margin_m: float, room_m: float) -> None:
+    place_m = np.array([0.0, 0.0, -1.5])
+    path = PlannedPath(0, np.tile(place_m, (STAGES, 1)), np.full((STAGES, 3), margin_m))
+    report = Report(path, np.zeros(3), in_use=0, decided=0, goal_m=place_m)
+    cell = issue(begin_without_cells(0, [report], PARAMETERS), PARAMETERS).newest[0]
+    np.testing.assert_allclose(cell.upper_m - place_m, room_m + PARAMETERS.margin_m, atol=2e-4)
+    np.testing.assert_allclose(place_m - cell.lower_m, room_m + PARAMETERS.margin_m, atol=2e-4)

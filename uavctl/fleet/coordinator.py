@@ -55,6 +55,9 @@ class CellParameters:
     shift_stages: int = (
         6  # change of the age of a position until a cell is decided about: three lost positions of 20 Hz
     )
+    # Largest margin that a cell leaves room for. Where a cell is wide, rows that do not bind take margins of up to
+    # 4.75 σ, so without it cells widen from one to the next, to 2 m. A plan that needs more refuses the cell
+    max_margin_m: float = 0.4
     reach_m: float = 1.2  # longest extension beyond the plan: about the way of a plan between two cells
     silence_s: float = 1.0  # time without a report after which a vehicle counts as an obstacle
 
@@ -319,12 +322,12 @@ def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[
     """Gather the positions (N, 3), the room around each stage of a plan (N, S, 3), and the boxes of the plans.
 
     Box s contains the mean of stages s and s + 1, with the room around it, inside of a cell in use. The room is the
-    largest margin of the stages nearby: it moves there as the age of the position changes.
+    largest margin of the stages nearby, up to a limit: it moves there as the age of the position changes.
     """
     plans = [report.plan.advance(state.step) for report in state.reports]
     mean_m, margin_m = np.array([plan.mean_m for plan in plans]), np.array([plan.margin_m for plan in plans])
     shift = parameters.shift_stages
-    padded_m = np.pad(margin_m, ((0, 0), (shift, shift), (0, 0)))
+    padded_m = np.pad(np.minimum(margin_m, parameters.max_margin_m), ((0, 0), (shift, shift), (0, 0)))
     room_m = sliding_window_view(padded_m, 2 * shift + 1, axis=1).max(axis=3) + parameters.margin_m
     lower_m, upper_m = mean_m - room_m, mean_m + room_m
     later = np.minimum(np.arange(parameters.stages) + 1, parameters.stages - 1)
