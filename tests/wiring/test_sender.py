@@ -6,9 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
+from places import ROOT
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.cameras import Cameras
+from uavctl.cli.fleet import read_fleet
 from uavctl.config import Config, load
 from uavctl.frames import Quaternion
 from uavctl.io.shared_sources import find_shared_sources
@@ -17,7 +20,7 @@ from uavctl.mavlink.connection import MOCAP, MavlinkConnection, make_links
 from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.messages import TimeSync
 from uavctl.records import PositionSample, Vec3
-from uavctl.wiring.radio import RadioConfig, compute_link_wait_s
+from uavctl.wiring.radio import RadioConfig, build_fleet_values, build_message_values, compute_link_wait_s
 from uavctl.wiring.sender import UNUSED, PositionSender, SentPosition
 
 START_NS = 1_000_000_000_000
@@ -227,3 +230,16 @@ def test_what_a_source_asks_or_answers_unasked_has_no_effect() -> None:
     sent = sender.send_next(START_NS + 1000)
     assert isinstance(sent, SentPosition)
     assert sent.captured_ns == START_NS + 1000 - round(make_config().clock.latency_s * 1e9)
+
+
+def test_vehicles_of_one_kind_are_computed_once_and_others_for_themselves() -> None:
+    fleet = read_fleet(ROOT / "docs" / "examples" / "radio.toml")
+    configs = [member.config for member in fleet.members[:2]]
+    configs.append(replace(configs[0], plant=replace(configs[0].plant, wind_std_mps2=(0.9, 0.9, 0.9))))
+    results = build_fleet_values(configs, RADIO)
+    assert results[0] is results[1]
+    for config, (values, stds_m) in zip(configs, results, strict=True):
+        expected_values, expected_stds_m = build_message_values(config, RADIO)
+        np.testing.assert_array_equal(values, expected_values)
+        np.testing.assert_array_equal(stds_m, expected_stds_m)
+    assert results[2][0][-1] > results[0][0][-1]

@@ -190,6 +190,24 @@ def build_message_values(config: Config, radio: RadioConfig) -> tuple[Array, Arr
     return compute_message_values(costs, radio.loss), stds_m
 
 
+def build_fleet_values(configs: Sequence[Config], radio: RadioConfig) -> list[tuple[Array, Array]]:
+    """Return `build_message_values` of each vehicle, computed once for vehicles of one kind."""
+    replace, known, results = msgspec.structs.replace, list[tuple[Config, tuple[Array, Array]]](), []
+    for config in configs:
+        # What differs between vehicles of one kind, and has no part in the values
+        daemon = replace(config.daemon, vehicle="", mocap="")
+        first = configs[0]
+        kind = replace(
+            config, daemon=daemon, security=first.security, sets=first.sets, target=first.target, sim=first.sim
+        )
+        values = next((values for other, values in known if other == kind), None)
+        if values is None:
+            values = build_message_values(config, radio)
+            known.append((kind, values))
+        results.append(values)
+    return results
+
+
 def compute_quantile(config: Config) -> float:
     """Return κ of the allowed risk, Φ⁻¹(δ_x)."""
     return NormalDist().inv_cdf(config.smpc.delta_x)
@@ -211,7 +229,7 @@ class RadioSchedule:
 
     def __init__(self, configs: Sequence[Config], radio: RadioConfig, start_ns: int) -> None:
         max_wait_slots = compute_max_wait_slots(radio, len(configs))
-        values, stds_m = zip(*(build_message_values(config, radio) for config in configs), strict=True)
+        values, stds_m = zip(*build_fleet_values(configs, radio), strict=True)
         self._wait_stds_m = [float(stds[min(max_wait_slots, len(stds) - 1)]) for stds in stds_m]
         self._quantiles = [compute_quantile(config) for config in configs]
         limits = [list(zip(*get_position_limits_m(config).values(), strict=True)) for config in configs]
