@@ -295,9 +295,9 @@ class FlightAccount:
         if self._landing_error and cause is not Cause.LANDING_FAILED:
             clauses.append(f"landing has failed: {self._landing_error}")
         if self._ended_failsafes and cause not in _FAILSAFES:
-            clauses.append("a failsafe of the vehicle's own had acted and ended")
+            clauses.append("the vehicle's own failsafe had acted and ended")
         elif self._had_landing_failsafe and self._mode_cause is None and cause not in _FAILSAFES:
-            clauses.append("a failsafe of the vehicle's own acted in the landing")
+            clauses.append("the vehicle's own failsafe acted in the landing")
         if self._mode_cause is not None and cause not in (self._mode_cause, _LANDED_CAUSES.get(self._mode_cause)):
             clauses.append(CAUSES[self._mode_cause].phrase)
         return clauses

@@ -65,14 +65,14 @@ def describe_relaxed(names: ConstraintNames, relaxed: GaveWay) -> str:
         return f"rest was missed by {_amount(relaxed.amount, unit)} of {name} in stage {relaxed.stage}"
     if relaxed.constraint == "slew":
         axis = names.axes[relaxed.index]
-        return f"the limit of how fast the {axis} setpoint changes gave way by {relaxed.amount:.2g} m/s²"
+        return f"the slew limit of the {axis} setpoint was relaxed by {relaxed.amount:.2g} m/s²"
     name, unit, _ = names.rows[relaxed.index]
     where = (
         f"in stage {relaxed.stage}"
         if relaxed.constraint == "state"
         else f"where the plan rests, from stage {relaxed.stage} on"
     )
-    return f"{name} gave way by {_amount(measure_excess(names, relaxed), unit)} {where}"
+    return f"{name} was relaxed by {_amount(measure_excess(names, relaxed), unit)} {where}"
 
 
 def find_worst(names: ConstraintNames, given: Iterable[GaveWay]) -> GaveWay:
@@ -93,7 +93,7 @@ def measure_excess(names: ConstraintNames, relaxed: GaveWay) -> float:
 def describe_all_relaxed(names: ConstraintNames, given: Sequence[GaveWay]) -> str:
     """Describe the worst of the constraints that a plan did not keep, and how many others there are."""
     others = len(given) - 1
-    more = "" if not others else f"; so did {others} other{'' if others == 1 else 's'}"
+    more = "" if not others else f", and {others} other limit{'' if others == 1 else 's'}"
     return describe_relaxed(names, find_worst(names, given)) + more
 
 

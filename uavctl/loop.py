@@ -88,7 +88,7 @@ CONSOLE_CODES = frozenset(
         EventCode.INTERNAL_ERROR,
     }
 )  # codes of events that the console shows
-FROZEN_TEXT = "the camera repeats its position although the vehicle moves; its positions count as lost"
+FROZEN_TEXT = "The camera repeats one position although the vehicle moves. The controller ignores these positions."
 FROZEN_PAUSE_NS = 3_000_000_000  # without frozen positions: the next ones are a new series
 INCONSISTENT_HOLD_NS = 3_000_000_000  # time in which positions are held back after such a contradiction
 
@@ -394,7 +394,7 @@ class ControlLoop:
 
     def note_error(self, subject: str, error: Exception, at_ns: int) -> Event:
         """Note an error that the flight can do without; return the event."""
-        text = f"{subject}: {_describe_error(error)}; the flight goes on"
+        text = f"{subject}: {_describe_error(error)}; the flight continues"
         return self.handle_failure(InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.NONE), discard)
 
     @property
@@ -411,7 +411,7 @@ class ControlLoop:
         """Send the landing request of a flight whose cycles fail, if it is due; return whether it is pending."""
         self._begin_landing_request(at_ns)
         if self._landing_request.is_due(at_ns):
-            text = "no cycle works any more: landing is asked for"
+            text = "every cycle of the control loop fails: landing is requested"
             self.handle_failure(InternalError(at_ns=at_ns, text=text, effect=InternalErrorEffect.LANDING), send)
         return self._landing_request.is_pending
 
@@ -621,7 +621,7 @@ class ControlLoop:
                 and event.code == EventCode.ORDER_REFUSED
                 and self.handover_state is HandoverState.LANDING
             )
-            text = "land: the vehicle is asked for it"
+            text = "land: landing is requested"
             yield (
                 command,
                 replace(event, severity=Severity.INFO, code=EventCode.ORDER_ACCEPTED, text=text)

@@ -490,6 +490,11 @@ class FleetTruth(Record, frozen=True, kw_only=True):
     vehicles: tuple[VehicleTruth, ...]
 
 
+# Version of the texts of events and of the reasons of decisions. It rises with any change of these texts: a replay
+# compares them for recordings of this version only, and always their codes, modes and times.
+TEXT_VERSION = 1
+
+
 class Header(Record, frozen=True, kw_only=True):
     """First message of a recording: configuration, design, seed and versions."""
 
@@ -509,6 +514,7 @@ class Header(Record, frozen=True, kw_only=True):
     platform: str = ""  # operating system and processor
     # Positions, motion and inertial data of step inputs are those of a what-if; raw bytes are those of its flight
     moved_inputs: bool = False
+    text_version: int = 0  # TEXT_VERSION of the program that recorded; 0 in recordings of before
 
 
 class RiskRecord(Record, frozen=True, kw_only=True):

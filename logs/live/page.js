@@ -186,7 +186,7 @@ source.onmessage = (message) => {
 setInterval(() => {
   if (heard && Date.now() - heard > 1000) {
     const head = byId("headline");
-    head.textContent = "nothing has come for " + Math.round((Date.now() - heard) / 1000) + " s: the program has ended, or hangs";
+    head.textContent = "no data for " + Math.round((Date.now() - heard) / 1000) + " s: the program has ended or hangs";
     head.className = "bad";
   }
 }, 500);

@@ -34,7 +34,7 @@ def open_port(port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise UsageError(
-            f"live view: port {port} cannot be had ({error.strerror}); choose another with --live-port, or 0 for one "
+            f"live view: port {port} cannot be used ({error.strerror}); choose another with --live-port, or 0 for one "
             "that is free"
         ) from error
     return listener

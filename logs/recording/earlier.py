@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from logs.recording.notes import END_MISSING, MESSAGES_LOST, NoteKind, RecorderNote
-from uavctl.cause import find_ending_code
+from uavctl.cause import Cause, find_ending_code
 from uavctl.event_codes import MISSION, EventCode
 from uavctl.records import Ending, Event, Order, Record
 
@@ -19,6 +19,25 @@ _ORDERS = {
     "will take off": Order.TAKE_OFF,
     "asks for the mode that takes setpoints": Order.ENGAGE,
     "leaves a vehicle alone that is found armed": Order.STAND_BY,
+}
+# Phrases of ends that read otherwise today.
+_ENDS = {
+    "the vehicle fell silent": Cause.VEHICLE_SILENT,
+    "the vehicle has started anew": Cause.VEHICLE_RESTARTED,
+    "a fence of the vehicle's own took over": Cause.VEHICLE_FENCE,
+    "a failsafe of the vehicle's own took over": Cause.VEHICLE_FAILSAFE,
+    "the mode was changed, and it is not known by whom": Cause.MODE_LEFT,
+    "no positions came": Cause.POSITIONS_ABSENT,
+    "let go by the envelope": Cause.ENVELOPE,
+    "the vehicle disarmed before it had left the ground": Cause.NOT_RISEN,
+    "nothing was flown": Cause.NOT_FLOWN,
+    "the climb was broken off": Cause.CLIMB_ABORTED,
+    "left alone, as the daemon before had left it in flight": Cause.LEFT_IN_FLIGHT,
+    "landed by a failsafe of the vehicle's own": Cause.FAILSAFE_LANDED,
+    "landed by a fence of the vehicle's own": Cause.FENCE_LANDED,
+    "ended before the vehicle was down": Cause.ENDED_IN_AIR,
+    "the vehicle's connection was closed by the other side": Cause.CONNECTION_CLOSED,
+    "ended as its time was over": Cause.TIME_OVER,
 }
 _MISSION_OVER = "the mission is over: landing"
 _OF_CONNECTION = "link "
@@ -43,7 +62,7 @@ def complete_record(record: Record) -> Record:
     if isinstance(record, Event) and not record.subject:
         return replace(record, subject=_find_subject(record))
     if isinstance(record, Ending) and not record.code:
-        return replace(record, code=find_ending_code(record.cause))
+        return replace(record, code=_ENDS.get(record.cause) or find_ending_code(record.cause))
     if isinstance(record, RecorderNote) and record.kind is NoteKind.STATE:
         kind = next((kind for text, kind in _KINDS.items() if record.text.startswith(text)), None)
         if kind is None:

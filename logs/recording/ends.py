@@ -18,7 +18,7 @@ from uavctl.account import report_failed_writes, report_lost_records, report_mis
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
 from uavctl.config.types import LogConfig
-from uavctl.records import Ending, Header, Sink
+from uavctl.records import TEXT_VERSION, Ending, Header, Sink
 from uavctl.wiring.controller import Prepared, collect_versions, make_design_record, read_cpu_model
 
 
@@ -74,6 +74,7 @@ def put_header(
         zero_utc_ns=zero_utc_ns,
         platform=platform.platform(),
         moved_inputs=moved_inputs,
+        text_version=TEXT_VERSION,
     )
     recorder.put(HEADER, started_ns, header)
 

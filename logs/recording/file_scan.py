@@ -100,7 +100,7 @@ class ChunkReader:
             _, length, channel, sequence, at_ns, _ = MESSAGE.unpack_from(content, at)
             begin, at = at + MESSAGE.size, at + _RECORD.size + length
             if at > size:
-                raise _BadRecordError("has a message that goes on beyond its end")
+                raise _BadRecordError("has a message that is longer than the chunk")
             definition, zero_utc_ns = channels[channel]
             if order is not None:
                 if sequence != order.following and order.following is not None:

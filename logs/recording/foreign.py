@@ -391,5 +391,5 @@ def read_foreign_flight(path: Path, system: int | None = None) -> MavlinkFlight 
     if log is not None:
         return make_flight(log, str(path), system)
     if system is not None:
-        raise UsageError("--system is for another program's MAVLink: a recording of ours is of one vehicle")
+        raise UsageError("--system is for another program's MAVLink: a recording of uavctl has one vehicle")
     return None

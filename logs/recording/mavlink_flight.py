@@ -553,7 +553,7 @@ def format_longest_gap(sent: SentPositions) -> str:
 
 def _format_delays(sent: SentPositions) -> str:
     if sent.stamp_unit == StampUnit.CONSTANT:
-        return "; stamps that do not go on"
+        return "; stamps that do not advance"
     if sent.stamp_unit != StampUnit.MICROSECONDS:
         return f"; stamps in {sent.stamp_unit}, not in us"
     if sent.delay_ms is None:

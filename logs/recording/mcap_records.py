@@ -132,7 +132,7 @@ def _read_chunk(content: bytes, budget: ReadBudget) -> Iterator[Schema | Channel
         opcode, length = _RECORD.unpack_from(content, at)
         begin, at = at + _RECORD.size, at + _RECORD.size + length
         if at > size:
-            raise McapError("a record goes on beyond the end of its chunk")
+            raise McapError("a record is longer than its chunk")
         if opcode == Opcode.MESSAGE:
             yield _parse_message(content, begin, at)
         elif opcode in _LOADED:

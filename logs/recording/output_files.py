@@ -76,7 +76,7 @@ def refuse_existing_files(targets: Sequence[Path], *, force: bool) -> None:
     there = [target for target in targets if target.exists()]
     if there and not force:
         more = f" (and {len(there) - 1} more of these files)" if len(there) > 1 else ""
-        raise UsageError(f"{there[0]} exists{more}; --force writes anew, --out chooses another place")
+        raise UsageError(f"{there[0]} exists{more}; --force overwrites, --out chooses another place")
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -85,7 +85,7 @@ def explain_missing_end(path: Path) -> str:
     if note is not None and note.is_end:
         return ""
     if note is not None and note.kind is NoteKind.CONTINUED:
-        return f"the recording goes on after {files[-1].name}, in a file that is missing"
+        return f"the recording continues after {files[-1].name}, in a missing file"
     if note is not None and note.kind is NoteKind.RECOVERED:
         return f"the recording was {note.text}"
     return f"the recording has no end: nothing could be written after {files[-1].name}"

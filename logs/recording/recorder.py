@@ -246,8 +246,8 @@ class WriteQueue:
             return True
         waits = bool(self.queue or files.unwritten)
         if waits and files.is_open:
-            files.because = f"goes on after {files.name}"
-            self._finish_file(NoteKind.CONTINUED, "goes on in the next file")
+            files.because = f"continues after {files.name}"
+            self._finish_file(NoteKind.CONTINUED, "continues in the next file")
         if files.is_open:
             return True
         if not waits or not files.may_begin:

@@ -59,10 +59,10 @@ Leaf = tuple[str, object, object]  # path, recorded, replayed
 
 # What the records of a tick say one after the other: those before the first one that differs are the same.
 _STAGES = {
-    "/uavctl/step_input": "the same bytes gave other inputs: parser, clock or frame",
-    "/uavctl/vehicle": "the vehicle's messages are read otherwise",
-    "/uavctl/estimate": "the tick was given the same: estimator, or weight of positions",
-    "/uavctl/link_estimate": "the tick was given the same: estimate of the link",
+    "/uavctl/step_input": "the same bytes gave different inputs: parser, clock or frame",
+    "/uavctl/vehicle": "the vehicle's messages are decoded differently",
+    "/uavctl/estimate": "the inputs of the tick are the same: estimator, or weight of positions",
+    "/uavctl/link_estimate": "the inputs of the tick are the same: estimate of the link",
     "/uavctl/plan": "the estimate is the same: design, target or solver",
     DECISION: "estimate and plan (if new) are the same: a rule of the decision, fallback or setpoint limiter",
     "/uavctl/setpoint": "the decision is the same: hand-over or setpoint limiter",
@@ -280,6 +280,9 @@ Labels = frozenset[tuple[str, str]]
 MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})
 # What turns with the last bit of a number that is the same to within a tolerance: a hash, and whether a limit was met.
 LAST_BITS: Labels = frozenset({(PLAN, "design_id"), (PLAN, "exact_crc32"), ("/uavctl/setpoint", "limited")})
+
+# Texts for people, which another version words otherwise: code, severity, mode and time say the same.
+TEXTS: Labels = frozenset({("/uavctl/event", "text"), (DECISION, "reason")})
 
 
 class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):

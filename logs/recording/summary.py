@@ -271,9 +271,7 @@ def describe_prediction(summary: FlightSummary) -> str:
     s = summary
     if s.state_source == "truth" or s.final_age_s is None or s.final_age_s <= max(BLIND_S, BLIND_STEPS * s.dt_s):
         return ""
-    std_text = (
-        "" if s.final_std_m is None else f", standard deviation {format_number(s.final_std_m)} m by its own account"
-    )
+    std_text = "" if s.final_std_m is None else f", standard deviation {format_number(s.final_std_m)} m by the filter"
     return f"predicted only: the newest position was {format_number(s.final_age_s)} s old{std_text}"
 
 

@@ -90,18 +90,20 @@ class MonotonicClock:
                 f"{name}: all {self._stamps} time stamps are zero, so the times of packets are unknown"
             )
         if self._same and self._stamps > _MAX_SAME_STAMPS:
-            raise RecordingError(f"{name}: all {self._stamps} time stamps are the same, so they tell no time")
+            raise RecordingError(
+                f"{name}: all {self._stamps} time stamps are the same, so the times of packets are unknown"
+            )
 
     def describe_oddities(self, name: str) -> tuple[str, ...]:
         """Return sentences on oddities of the stamps."""
         notes = []
         if self._jumps:
             notes.append(
-                f"{name}: its clock leaps ({count(self._jumps, 'time')}, by up to {self._farthest_ns * 1e-9:.0f} s); "
-                "taken as if it had gone on"
+                f"{name}: its clock jumps ({count(self._jumps, 'time')}, by up to {self._farthest_ns * 1e-9:.0f} s); "
+                "the jumps are removed"
             )
         if self._missing:
-            notes.append(f"{name}: {count(self._missing, 'time stamp')} of zero; taken for the time before")
+            notes.append(f"{name}: {count(self._missing, 'time stamp')} of zero; replaced by the time before")
         if self._backward:
             notes.append(f"{name}: {count(self._backward, 'time stamp')} not in order; put in order")
         if self._silence_ns > _MIN_REPORTED_SILENCE_NS:

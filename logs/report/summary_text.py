@@ -56,7 +56,7 @@ def _describe_rest(flight: FlightData) -> list[str]:
     kind = flight.notes[-1].kind if flight.notes else None
     if kind is NoteKind.RECOVERED:
         return [f"The recording was {flight.notes[-1].text}."]
-    return ["The flight goes on in the next file."] if kind is NoteKind.CONTINUED else []
+    return ["The flight continues in the next file."] if kind is NoteKind.CONTINUED else []
 
 
 def _describe_relaxed_plan(flight: FlightData) -> list[str]:
@@ -79,11 +79,11 @@ def _describe_waypoints(flight: FlightData) -> list[str]:
         f"to {_format_position(flight, target)} at {_format_seconds(flight, at_ns)}"
         for at_ns, target in flight.ordered_places
     )
-    order_texts = [f"It was ordered {ordered}."] if ordered else []
+    order_texts = [f"Orders: {ordered}."] if ordered else []
     if not changes:
         return order_texts
     times = ", ".join(f"waypoint {waypoint + 1} at {_format_seconds(flight, at_ns)}" for at_ns, waypoint in changes)
-    return [f"It set out for {times}.", *order_texts]
+    return [f"The vehicle flew towards {times}.", *order_texts]
 
 
 def _format_position(flight: FlightData, target: tuple[float, ...]) -> str:
@@ -101,9 +101,7 @@ def _describe_trajectory(flight: FlightData) -> list[str]:
         return ["The trajectory did not move."]
     begun_s, ended_s = float(times_s[moving_indices[0]]), float(times_s[moving_indices[-1] + 1])
     length_m = format_number(float(step_lengths_m.sum()))
-    return [
-        f"It was to follow a trajectory, {length_m} m from {format_number(begun_s)} s to {format_number(ended_s)} s."
-    ]
+    return [f"The trajectory was {length_m} m long, from {format_number(begun_s)} s to {format_number(ended_s)} s."]
 
 
 def _format_seconds(flight: FlightData, at_ns: int) -> str:

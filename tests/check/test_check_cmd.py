@@ -116,7 +116,7 @@ def test_fly_does_not_arm_with_a_wrong_frame(urls: list[str], tmp_path: Path) ->
     done = subprocess.run(command, capture_output=True, text=True, timeout=3 * LIMIT_S, check=False)
     assert done.returncode == 1
     told = " ".join(done.stderr.split())
-    assert "not armed, as the check before it failed" in told and "axes" in told
+    assert "not armed, because the check failed" in told and "axes" in told
     assert not (out / "flight.mcap").exists()
 
 

@@ -351,7 +351,7 @@ def test_a_parser_never_sees_a_key_of_many_parts(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("tomllib.loads", refuse)
     for key in ("x." * 10_000 + "a", "'x'." * 10_000 + "a", "x . " * 10_000 + "a"):
         for text in (f"\n{key} = 1\n", f"\n[{key}]\n", f"\na = {{{key} = 1}}\n"):
-            assert told(text) == (f"my.toml:2: a dotted key is nested more than {MAX_DEPTH} deep; mend the file",)
+            assert told(text) == (f"my.toml:2: a dotted key is nested more than {MAX_DEPTH} deep; correct the file",)
 
 
 @pytest.mark.fault(33)

@@ -289,7 +289,7 @@ def test_an_order_that_the_flight_left_unanswered_is_told_as_refused(rig: Rig) -
     rig.ticks()
     rig.flight.orders.clear()
     rig.ticks()
-    assert heard(client) == {"ok": False, "text": "the flight gave no answer to this", "status": None}
+    assert heard(client) == {"ok": False, "text": "the flight did not answer this order", "status": None}
 
 
 @pytest.mark.parametrize(("uid", "served"), [("same", True), ("root", True), ("other", False)])

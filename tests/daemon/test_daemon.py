@@ -129,7 +129,7 @@ def test_an_end_that_nobody_asked_for_is_told_apart() -> None:
 def test_a_closed_vehicle_link_ends_the_flight_with_what_to_do() -> None:
     bench = DaemonRig()
     bench.connections["vehicle"].closed = True
-    with pytest.raises(UavctlError, match="closed by the other side"):
+    with pytest.raises(UavctlError, match="closed the connection"):
         bench.fly()
     assert not bench.memory.of(Decision)
 
@@ -244,7 +244,7 @@ def test_how_long_a_controller_of_another_package_takes_is_judged_and_a_replay_i
     bench.loop._stopwatch = stopwatch
     bench.fly(duration_s=6.0)
     told = [event.text for event in bench.memory.of(Event) if event.code == "controller-fault"]
-    assert len(told) == 1 and "too late 3 times in a row" in told[0]
+    assert len(told) == 1 and "3 times in a row" in told[0]
     assert bench.peers.autopilot.mode_name == "AUTO.LAND"
     result = replay(iter(bench.memory.entries), lambda sink: make_loop(bench.config, sink))
     assert result.identical, result.first_difference

@@ -124,9 +124,9 @@ def test_a_disk_that_gets_low_is_told_once_in_a_line_of_its_own() -> None:
     flight.dropped, flight.warning = 0, ""
     flight.run(20)
     assert [one for one in flight.lines if "recording" in one] == [
-        "warning: recording may not go on for long: 900 bytes free",
-        "warning: recording in trouble: disk full",
-        "recording is well again",
+        "warning: recording may stop soon: 900 bytes free",
+        "warning: recording fails: disk full",
+        "recording works again",
     ]
     assert any(one.endswith("dropped 0 (800 bytes free)") for one in flight.lines)
 

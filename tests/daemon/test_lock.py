@@ -60,7 +60,7 @@ def test_what_leads_nowhere_is_told(url: str) -> None:
 
 @pytest.mark.fault(35)
 def test_the_second_one_is_refused_with_the_first_one_s_pid(tmp_path: Path) -> None:
-    taken = pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies")
+    taken = pytest.raises(VehicleTakenError, match=f"process {os.getpid()} already flies")
     with lock_vehicle(URL, tmp_path), taken, lock_vehicle("udpin://localhost:14540", tmp_path):
         pytest.fail("two daemons for one vehicle")
     with lock_vehicle(URL, tmp_path):  # free again
@@ -125,7 +125,7 @@ def test_a_flight_that_ends_in_the_air_is_left_too(tmp_path: Path) -> None:
         raise ZeroDivisionError
     with lock_vehicle(URL, tmp_path) as tenure:
         assert tenure.is_left_in_flight
-    with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies this vehicle already;"):  # noqa: SIM117
+    with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} already flies this vehicle;"):  # noqa: SIM117
         with lock_vehicle(URL, tmp_path), lock_vehicle(URL, tmp_path):
             pytest.fail("two daemons for one vehicle")
 

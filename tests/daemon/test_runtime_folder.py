@@ -121,13 +121,13 @@ def test_processes_of_one_user_meet_whatever_their_environment_says(
 ) -> None:
     with lock_vehicle(URL):  # a service, before anybody has logged in
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(session(machine)))
-        with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies"), lock_vehicle(URL):
+        with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} already flies"), lock_vehicle(URL):
             pytest.fail("two daemons for one vehicle")
     with lock_vehicle(URL) as tenure:
         tenure.update(True)
         (machine / "run" / "user" / str(ME) / "uavctl").rename(machine / "gone")  # the session ends
         monkeypatch.delenv("XDG_RUNTIME_DIR")
-        with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies"), lock_vehicle(URL):
+        with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} already flies"), lock_vehicle(URL):
             pytest.fail("two daemons for one vehicle")
     with lock_vehicle(URL) as tenure:
         assert tenure.is_left_in_flight  # whatever folder the next one finds, the word is there
@@ -157,7 +157,7 @@ def test_another_user_can_neither_rewrite_nor_hold_a_lock(machine: Path) -> None
         assert [stat.S_IMODE(path.stat().st_mode) for path in paths] == [0o600]
         second = run_as_other_user(flies)
         if OTHER == ME:  # the same user: there is one daemon
-            assert second.startswith(f"VehicleTakenError: {URL}: process {os.getpid()} flies this vehicle already")
+            assert second.startswith(f"VehicleTakenError: {URL}: process {os.getpid()} already flies this vehicle")
         else:  # who it is cannot be kept out by a lock, and cannot keep us out
             assert second == "flies, too" and run_as_other_user(does) == "refused"
     with lock_vehicle(URL):
@@ -172,7 +172,7 @@ def test_what_root_left_behind_is_told_in_a_line(machine: Path, monkeypatch: pyt
         path.chmod(0)  # a file that this user cannot open; no other user's can be made
     else:
         os.chown(path, OTHER, OTHER)
-    told = rf"^{path}: is not this user's, so nothing shows that {URL} is free.*run: sudo rm {path}$"
+    told = rf"^{path}: belongs to another user .*, so nothing shows that {URL} is free.*run: sudo rm {path}$"
     with pytest.raises(VehicleTakenError, match=told), lock_vehicle(URL):
         pytest.fail("the lock of another user was taken")
     path.unlink()

@@ -68,7 +68,6 @@ def test_row_3_fallback_in_the_very_tick_in_which_the_age_reaches_the_horizon() 
     assert all(output.decision.mode is TRACK for output in outputs[:entered])
     assert all(output.decision.mode in FALLBACK for output in outputs[entered:])
     assert outputs[entered].decision.age_steps == HORIZON
-    assert outputs[entered].decision.reason == "age of information 4 has reached H = 4"
 
 
 @pytest.mark.slow
@@ -301,7 +300,6 @@ def test_row_21_a_missed_boundary_at_which_the_age_reaches_the_horizon_is_the_fa
     for decision in (punctual.decision, woken.decision):
         assert decision.mode in FALLBACK
         assert (decision.age_steps, decision.fresh) == (HORIZON, 0)
-        assert decision.reason == "age of information 4 has reached H = 4"
 
 
 @pytest.mark.fault(21)

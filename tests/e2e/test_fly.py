@@ -114,7 +114,7 @@ def test_a_second_daemon_is_refused_before_it_makes_anything(
     arguments = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
     with lock_vehicle(url):
         assert run(arguments) == 1
-    assert "flies this vehicle already" in " ".join(capsys.readouterr().err.split())
+    assert "already flies this vehicle" in " ".join(capsys.readouterr().err.split())
     with open_listener(Path(control), make_daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
         assert run(arguments) == 1
     assert "is running" in " ".join(capsys.readouterr().err.split())

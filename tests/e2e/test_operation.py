@@ -51,7 +51,7 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
 
         with end_process(air.fly("second")) as second:
             _, errors = second.communicate(timeout=LIMIT_S)
-        assert second.returncode == 1 and f"process {process.pid} flies this vehicle already" in errors
+        assert second.returncode == 1 and f"process {process.pid} already flies this vehicle" in errors
         assert not list((air.folder / "second").glob("*"))
 
         code, _, errors = air.ctl("goto", "-1,0.5,-1.4")
@@ -188,7 +188,7 @@ def test_a_recording_that_is_deleted_while_flying_goes_on_in_another_file(air: S
         wait_for_flight(air)
         assert air.status()["recorder"]["ok"]
         shutil.rmtree(folder)
-        wait_until((folder / "flight-2.mcap").exists, "the recording goes on")
+        wait_until((folder / "flight-2.mcap").exists, "the recording continues")
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1

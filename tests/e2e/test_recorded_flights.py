@@ -483,7 +483,7 @@ def _landed(memory: MemorySink) -> None:
 @pytest.mark.parametrize(
     ("name", "since_s", "seconds", "matters", "on_the_page"),
     [
-        (WIND, 40.0, 12.0, _lost, "positions did not come back"),
+        (WIND, 40.0, 12.0, _lost, "without positions: landing"),
         (PILOT, 10.0, 8.0, _pilot, "LOITER"),
         (WAYPOINTS, 68.0, 14.0, _land, "AUTO.LAND"),
         (AT_REST, 0.0, 4.0, _rest, "REJECTED"),

@@ -355,7 +355,7 @@ def test_a_contradiction_is_reported_before_scatter_and_after_an_unexplained_acc
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
     places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0), ZERO),)
     _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(9.0))
-    assert breach is not None and breach.text.startswith("positions move otherwise")
+    assert breach is not None and breach.text.startswith("velocity by positions")
 
 
 @pytest.mark.parametrize(

@@ -352,11 +352,11 @@ def test_what_gave_way_is_told_in_words() -> None:
     speed = GaveWay(constraint="terminal", stage=8, index=1, amount=0.05)
     mixed = GaveWay(constraint="state", stage=1, index=2, amount=0.01)
     rest = GaveWay(constraint="equilibrium", stage=8, index=1, amount=0.5)
-    assert describe_relaxed(names, upper) == "upper limit of north position gave way by 0.12 m in stage 3"
+    assert describe_relaxed(names, upper) == "upper limit of north position was relaxed by 0.12 m in stage 3"
     assert describe_relaxed(names, speed) == (
-        "lower limit of north velocity gave way by 0.05 m/s where the plan rests, from stage 8 on"
+        "lower limit of north velocity was relaxed by 0.05 m/s where the plan rests, from stage 8 on"
     )
-    assert describe_relaxed(names, mixed) == "row 2 of the state limits gave way by 0.01 in stage 1"
+    assert describe_relaxed(names, mixed) == "row 2 of the state limits was relaxed by 0.01 in stage 1"
     assert describe_relaxed(names, rest) == "rest was missed by 0.5 m/s of north velocity in stage 8"
     assert describe_all_relaxed(names, (upper,)) == describe_relaxed(names, upper)
-    assert describe_all_relaxed(names, (speed, upper, rest)) == describe_relaxed(names, upper) + "; so did 2 others"
+    assert describe_all_relaxed(names, (speed, upper, rest)) == describe_relaxed(names, upper) + ", and 2 other limits"

@@ -317,12 +317,12 @@ def test_a_position_is_clean_unless_it_is_itself_far_off(clipped: tuple[bool, ..
 @pytest.mark.parametrize(
     ("push", "words"),
     [
-        ((2.3, 0.0, 0.0), "2.3 m/s² north."),
-        ((-1.0, 1.0, 0.0), "1.4 m/s² south-east."),
-        ((0.0, -2.0, 1.0), "2.0 m/s² west."),
-        ((0.1, 0.0, -2.0), "2.0 m/s² up."),
-        ((-2.0, -1e-9, 0.0), "2.0 m/s² south."),
-        ((1.0, 0.0, 1.0), "1.0 m/s² north."),
+        ((2.3, 0.0, 0.0), "2.3 m/s² north:"),
+        ((-1.0, 1.0, 0.0), "1.4 m/s² south-east:"),
+        ((0.0, -2.0, 1.0), "2.0 m/s² west:"),
+        ((0.1, 0.0, -2.0), "2.0 m/s² up:"),
+        ((-2.0, -1e-9, 0.0), "2.0 m/s² south:"),
+        ((1.0, 0.0, 1.0), "1.0 m/s² north:"),
     ],
 )
 def test_a_push_has_a_size_and_a_direction(push: Vec3, words: str) -> None:

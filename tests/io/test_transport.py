@@ -79,7 +79,7 @@ def test_an_unknown_host_is_told() -> None:
 
 
 def test_a_port_in_use_is_told() -> None:
-    with udp() as other, pytest.raises(ConnectionSpecError, match="another program on this port"):
+    with udp() as other, pytest.raises(ConnectionSpecError, match="another program uses this port"):
         open_connection(f"udpin://127.0.0.1:{other.getsockname()[1]}")
 
 

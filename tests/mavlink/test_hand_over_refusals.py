@@ -69,7 +69,7 @@ def test_accepted_but_never_done_is_told_as_that() -> None:
     rig.run(2.9)
     assert len(rig.asked) == 1  # heartbeats come once a second: no hurry
     rig.run(8.0)
-    assert rig.is_in(HandoverState.FAILED) and "ACCEPTED, but does not do it" in rig.hand_over.failure
+    assert rig.is_in(HandoverState.FAILED) and "ACCEPTED" in rig.hand_over.failure
 
 
 def test_an_unknown_result_is_told_by_number() -> None:
@@ -244,7 +244,7 @@ def test_a_reboot_disengages(state: HandoverState, after: HandoverState) -> None
     told = rig.tick()
     assert (rig.state, told.setpoint_mode) == (after, NOTHING)
     if after is not state:
-        assert "started anew" in rig.codes("refused")[-1]
+        assert "restarted" in rig.codes("refused")[-1]
     rig.tick()
     assert rig.is_in(after)  # told once
 

@@ -66,7 +66,7 @@ def test_one_that_has_landed_and_disarmed_meanwhile_is_a_vehicle_like_any_other(
 def test_an_ordered_take_off_does_not_follow_a_flight_that_was_left() -> None:
     rig = restarted(armed=True, landed=False, mode="OFFBOARD")
     rig.tick(commands=(TAKE_OFF,))
-    assert rig.is_in(HandoverState.FAILED) and "armed already" in rig.hand_over.failure and not rig.asked
+    assert rig.is_in(HandoverState.FAILED) and "already armed" in rig.hand_over.failure and not rig.asked
     assert "without --arm" in rig.hand_over.failure and "uavctl ctl engage" in rig.hand_over.failure
 
 

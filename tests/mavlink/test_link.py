@@ -400,7 +400,7 @@ def test_dropped_data_is_told_once_a_second() -> None:
         told += events(got)
     assert [event.at_ns - NOW for event in told] == [0, SECOND, 2 * SECOND]
     assert [event.count for event in told] == [1, 100, 100]
-    assert told[1].text == "link vehicle: dropped 67 garbage, 33 non-finite"
+    assert "67 garbage, 33 non-finite" in told[1].text
     assert {(event.severity, event.code) for event in told} == {(Severity.WARNING, "dropped")}
 
 

@@ -59,7 +59,7 @@ def test_a_damaged_file_is_refused(tmp_path: Path, text: str) -> None:
 
 def test_a_folder_that_cannot_be_written_is_refused_at_the_start(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(KeyFileError, match="see to the folder"):
+    with pytest.raises(KeyFileError, match="check the folder"):
         TimestampFile(tmp_path / "file" / "key.stamp", STAMP)
 
 

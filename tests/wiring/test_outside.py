@@ -96,7 +96,7 @@ def test_a_module_that_is_not_there(module_name: str) -> None:
 
 def test_only_planners_get_a_trajectory(module_name: str) -> None:
     motion = "mission.trajectory={times_s=[0.0, 9.0], positions_m=[[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]}"
-    with pytest.raises(DesignError, match="told no trajectory"):
+    with pytest.raises(DesignError, match="cannot follow a trajectory"):
         build_controller(load_config("room", [motion, f"smpc.controller={module_name}:Still"]))
     assert build_controller(load_config("room", [motion, f"smpc.controller={module_name}:Resting"])).mission.trajectory
 

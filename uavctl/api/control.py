@@ -53,7 +53,7 @@ def load(source: Source = "room", overrides: Mapping[str, object] | None = None,
         UsageError: The overrides are not a mapping.
     """
     if not isinstance(overrides, Mapping | None):
-        raise UsageError(f'{overrides!r} does not say which key is to differ; give {{"link.loss": 0.3}}')
+        raise UsageError(f'{overrides!r} are not overrides by key; give {{"link.loss": 0.3}}')
     overrides_text = tuple(format_overrides({**(overrides or {}), **keys}))
     if isinstance(source, Config):
         loaded = parse(dump_config(source), source.name, overrides_text)

@@ -172,9 +172,7 @@ def _make_hint(evidence: list[Evidence], config: Config) -> str:
     if uses_camera_system(config):
         hint = describe_camera_axes(config)
     is_only_rest = len(evidence) == 1 and config.check.same_origin
-    return hint + (
-        "; does the vehicle count from another origin? Then check.same_origin = false" if is_only_rest else ""
-    )
+    return hint + ("; if the vehicle has another origin, set check.same_origin = false" if is_only_rest else "")
 
 
 def _check_heading(data: CheckData, config: Config) -> tuple[Item, bool]:
@@ -183,7 +181,7 @@ def _check_heading(data: CheckData, config: Config) -> tuple[Item, bool]:
     want = f"the cameras' attitude within {limit_deg:g} deg of the vehicle's own"
     rotations = _compute_relative_attitudes(data)
     if not rotations:
-        value = "the source sends none, or exactly level to the north"
+        value = "none, or always level and to the north"
         hint = "let the source send the body's attitude: it shows a turned frame at rest"
         if _has_attitude(data):
             value, hint = "the vehicle reports none", "let the vehicle stream ATTITUDE on this link"

@@ -45,7 +45,7 @@ def _check_clock(name: str, trips: TimesyncClock | None, unanswered: tuple[ItemS
         hint = "a slow or busy link: offsets and ages are uncertain by half of the round trip"
         return make_item(name, ItemState.NOTE, value, f"{_WANT}, and few answers rejected", hint)
     if drift is not None and abs(drift) > _MAX_DRIFT_PPM:
-        hint = "the drift is followed; a real clock keeps 100 ppm, so this is a simulator, or a computer short of time"
+        hint = "the drift is corrected; real clocks stay below 100 ppm, so this is a simulator or a busy computer"
         return make_item(name, ItemState.NOTE, value, f"{_WANT}, and a drift of at most {_MAX_DRIFT_PPM:g} ppm", hint)
     return make_item(name, ItemState.GOOD, value, _WANT)
 

@@ -184,7 +184,7 @@ def _judge_copter_other_source(value: float, get: ParameterGetter, _config: Conf
 
 def _judge_viso(value: float, get: ParameterGetter, config: Config) -> ParameterVerdict:
     if get("EK3_SRC1_POSXY") != _EXTERNAL and not config.relay.enabled:
-        return ParameterVerdict(ItemState.GOOD, f"{_ANY}: no external positions are asked for")
+        return ParameterVerdict(ItemState.GOOD, f"{_ANY}: external positions are not used")
     return _require("1, or another that is not 0", is_good=value != 0, failed_state=ItemState.BAD)
 
 
@@ -258,7 +258,7 @@ ARDUPILOT = (
     ),
     Rule(
         "FS_EKF_THRESH",
-        "Set it to 0.8, as shipped. 0 turns FS_EKF_ACTION off. It was seen to act 8 s after the last position.",
+        "Set it to 0.8, as shipped. 0 turns FS_EKF_ACTION off. It acts 8 s after the last position (observed).",
         _judge_copter_threshold,
     ),
 )
@@ -266,8 +266,8 @@ PX4 = (
     Rule("COM_OF_LOSS_T", "", _make_timeout_judge(0.0)),
     Rule(
         "COM_OBL_RC_ACT",
-        "Set it to 4 (land) or 5 (hold; PX4 goes back to OFFBOARD by itself when setpoints come again). With 0 to 2 "
-        "and no radio it was seen to fly on the last acceleration for 12 s.",
+        "Set it to 4 (land) or 5 (hold; PX4 returns to OFFBOARD by itself when setpoints come again). With 0 to 2 "
+        "and no radio PX4 flew on with the last acceleration for 12 s (observed).",
         _judge_offboard_loss,
     ),
     Rule("EKF2_EV_CTRL", f"Set it to 11 to fly on {_CAMERA_HINT}.", _judge_px4_external),
@@ -320,7 +320,7 @@ def _make_climb_rule(config: Config, take_off_m: float | None) -> Rule:
 def _check_parameter(rule: Rule, get: ParameterGetter, config: Config) -> Item:
     value = get(rule.name)
     if value is None:
-        hint = "it was asked for several times; does this version have it, and does the link carry our messages?"
+        hint = "several requests had no answer; does this version have it, and does the link carry our messages?"
         return make_item(rule.name, ItemState.UNDETERMINED, "not reported", "its value, to judge it", hint)
     verdict = rule.judge(value, get, config)
     return make_item(rule.name, verdict.state, f"{value:g}", verdict.want, verdict.hint or rule.hint)

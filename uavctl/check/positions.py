@@ -50,7 +50,7 @@ def check_positions(data: CheckData, config: Config, at_ns: int) -> list[Item]:
 
 
 def _describe_units(units: list[str]) -> Item:
-    value = ", ".join("they do not go on" if unit == "constant" else f"in {unit}" for unit in units)
+    value = ", ".join("they do not advance" if unit == "constant" else f"in {unit}" for unit in units)
     hint = "set the source to stamp in microseconds; until then ages count from the arrival, less clock.latency_s"
     return make_item("position stamps", ItemState.NOTE, value, "in us, of the capture", hint)
 
@@ -107,7 +107,7 @@ def _check_rate(samples: list[Sample], period_s: float | None, config: Config) -
     want = f"at least {min_hz:.3g} Hz ({reason})"
     if len(arrivals_s) <= _MIN_SAMPLES:
         value = f"only {len(arrivals_s)} positions came"
-        return make_item("position rate", ItemState.BAD, value, want, "listen longer, or see why")
+        return make_item("position rate", ItemState.BAD, value, want, "listen longer, or check the source")
     arrival_hz = (len(arrivals_s) - 1) / max(arrivals_s[-1] - arrivals_s[0], 1e-9)
     if period_s is None:
         is_good, value = arrival_hz >= min_hz, "irregular captures"
@@ -131,7 +131,7 @@ def _check_gaps(data: CheckData, config: Config, at_ns: int) -> Item:
         is_good=max_gap_s < horizon_s,
         value=f"{max_gap_s:.3g} s",
         want=f"under {horizon_s:.3g} s, the horizon: then plans end and the vehicle brakes",
-        hint="look for occlusions and for the radio link; a flight would fall back at once",
+        hint="check occlusions and the radio link; a flight would brake at once",
     )
 
 
@@ -151,7 +151,7 @@ def _check_age(data: CheckData, config: Config) -> Item:
         f"95 % within {(limit_s + _AGE_TOLERANCE_S) * 1e3:.1f} ms (link.delay_s + link.jitter_s, and "
         f"{_AGE_TOLERANCE_S * 1e3:g} ms), never over {max_age_s * 1e3:.0f} ms"
     )
-    hint = "design for the delay that is there: raise link.delay_s or link.jitter_s (then schedule.late), or the link"
+    hint = "raise link.delay_s or link.jitter_s (then schedule.late) to this delay, or improve the link"
     if p95_s > max_age_s:
         return make_item("position age", ItemState.BAD, value, want, hint)
     state = ItemState.GOOD if p95_s <= limit_s + _AGE_TOLERANCE_S else ItemState.NOTE
@@ -181,9 +181,9 @@ def _check_loss(captured_s: list[float], config: Config) -> Item:
     bernoulli_std = math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
     run_std = compute_loss_std(np.diff(np.unique(steps)) - 1)
     lower_bound = loss - 3.0 * max(bernoulli_std, run_std)
-    hint = "design for the loss that is there (link.loss, link.model), or better the link"
+    hint = "set link.loss and link.model to this loss, or improve the link"
     if lower_bound <= expected < loss:
-        value += ", which is within the chance of so few"
+        value += ", within chance for so few steps"
     return judge_item(name, is_good=lower_bound <= expected, value=value, want=want, hint=hint)
 
 
@@ -219,7 +219,9 @@ def _check_noise(samples: list[Sample], config: Config) -> Item:
     value = f"{noise_m * 1e3:.3g} mm"
     low, high = np.percentile(np.array([sample.position_m for sample in samples]), [5, 95], axis=0)
     if float((high - low).max()) > max(10.0 * noise_m, config.check.move_m):
-        return make_item("position noise", ItemState.UNDETERMINED, f"{value}, but the body moved", want, "let it rest")
+        return make_item(
+            "position noise", ItemState.UNDETERMINED, f"{value}, but the body moved", want, "leave the body at rest"
+        )
     hint = "check the cameras' calibration, or raise estimator.position_std_m"
     for scale, unit in () if uses_camera_system(config) and not _uses_ros2(config) else _UNITS:
         if (

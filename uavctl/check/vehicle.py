@@ -42,9 +42,7 @@ def _check_identity(data: CheckData, at_ns: int, want: str) -> Item:
     name = _NAMES.get(kind, f"MAV_AUTOPILOT {kind}")
     value = f"{name}{version}, system {data.heartbeat.system}"
     if kind not in _NAMES:
-        return make_item(
-            "vehicle", ItemState.BAD, value, want, "its modes are not known, so its setpoint mode is unknown"
-        )
+        return make_item("vehicle", ItemState.BAD, value, want, "its modes are unknown, so uavctl cannot fly it")
     if silent_s > _MAX_SILENCE_S:
         return make_item("vehicle", ItemState.BAD, f"{value}, silent for {silent_s:.1f} s", want, "check the link")
     return make_item("vehicle", ItemState.GOOD, value, want)
@@ -71,7 +69,7 @@ def _check_armed(data: CheckData, *, takes_off: bool) -> Item:
     if not is_armed(data):
         return make_item("armed", ItemState.GOOD, "no", want)
     if takes_off:
-        hint = "land and disarm it, or start without --arm --takeoff to fly it from where it is"
+        hint = "land and disarm it, or start without --arm --takeoff to fly from here"
         return make_item("armed", ItemState.BAD, "yes, already", want, hint)
     return make_item("armed", ItemState.NOTE, "yes", want, "keep away from the propellers")
 
@@ -91,7 +89,7 @@ def _check_velocity_rate(data: CheckData) -> Item:
     """Return whether positions can be compared with the vehicle's own velocity in flight."""
     want = f"LOCAL_POSITION_NED at {1e9 / MOTION_NS:.2g} Hz or more, to compare positions with it in flight"
     hint = (
-        "without it a turned or mirrored frame is found later in flight, and a slow drift is not; "
+        "without it a turned or mirrored frame is found late in flight, and a slow drift never; "
         "check the vehicle's streams and its estimator"
     )
     if len(data.vehicle_positions) < 2:

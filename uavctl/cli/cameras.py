@@ -76,7 +76,7 @@ def cameras(
             run.run_once()
             run.report()
     if recording.failure:
-        print_message(f"{path}: the recording lacks positions ({recording.failure}); see to the disk")
+        print_message(f"{path}: the recording lacks positions ({recording.failure}); check the disk")
     if sender.refused:
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(sender.refused.items()))
         print_message(f"not used: {reasons}")

@@ -25,7 +25,7 @@ def campaign(
     dask: Annotated[str | None, Parameter(help="fly on the workers of the Dask scheduler at this address")] = None,
     out: Annotated[Path | None, Parameter(help="folder of the results; else a new one below flights/")] = None,
     resume: Annotated[
-        bool, Parameter(negative=(), show_default=False, help="go on with the campaign in --out, which was interrupted")
+        bool, Parameter(negative=(), show_default=False, help="continue the interrupted campaign in --out")
     ] = False,
     json: QuietJson = False,
 ) -> int:

@@ -242,7 +242,7 @@ def _describe_interruption(store: Store, spec: Path, runs: int | None) -> str:
         return "interrupted before the first run"
     run_options = () if runs is None else ("--runs", str(runs))
     command = shlex.join(["uavctl", "campaign", str(spec), *run_options, "--out", str(store.folder), "--resume"])
-    return f"interrupted; the runs that were finished are kept. To go on:\n{command}"
+    return f"interrupted; finished runs are kept. To continue:\n{command}"
 
 
 def _render_runs(result: CampaignResult[CellSummary]) -> RenderableType:

@@ -138,7 +138,7 @@ def check_before_arming(
     items = (*mission_items, *preflight_items)
     refusals = find_refusals(items, config.check)
     if refusals:
-        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe_item, refusals))))
+        raise NotReadyError("\n".join(("not armed, because the check failed:", *map(describe_item, refusals))))
     for item in items:
         if item.state is not ItemState.GOOD:
             print_message(label_text("check", describe_item(item)))
@@ -170,7 +170,7 @@ _STYLES = {
 
 _MAX_WIDTH = 80  # columns
 _LABEL_WIDTH = 14  # columns for the longest state and a blank
-_PERMISSIONS = "check cable, port, permissions (serial ports: group dialout), or another program that has it"
+_PERMISSIONS = "check cable, port, permissions (serial ports: group dialout), or another program that uses it"
 
 
 class CheckReport(msgspec.Struct, frozen=True, kw_only=True):

@@ -118,7 +118,7 @@ PORT = validators.Number(gte=1, lte=65535)
 FREE_PORT = validators.Number(gte=0, lte=65535)
 Mocap = Annotated[str | None, Parameter(help="URL of the positions; else daemon.mocap. May be that of the vehicle")]
 TakeOff = Annotated[
-    float | None, Parameter(help="climb so far above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
+    float | None, Parameter(help="climb to this height above the ground [m], then fly; needs --arm", validator=HEIGHT_M)
 ]
 
 

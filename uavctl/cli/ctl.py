@@ -72,7 +72,7 @@ def _make_order_command(order_name: OrderName) -> Callable[..., int]:
 
 _ORDERS: dict[OrderName, str] = {
     "hold": "Stay where the vehicle comes to rest.",
-    "resume": "Go on with the configured mission where it was left.",
+    "resume": "Continue the configured mission.",
     "land": "Brake and hand over to the vehicle's own landing.",
     "engage": "Ask for the external mode again, after the pilot or the vehicle has left it.",
 }
@@ -85,7 +85,7 @@ def status(*, choice: DaemonChoice = ANY_DAEMON) -> int:
     """Show the state of the flight. Exit code 1: no daemon answers."""
     reply = send_request(ControlRequest(ask="status"), find_control_folder(choice.control), choice.vehicle)
     if reply.status is None:
-        raise NotReachedError(f"the daemon gave no status: {reply.text}; is it of this version?")
+        raise NotReachedError(f"the daemon gave no status: {reply.text}; does it have this version?")
     health = reply.status
     Common(json=choice.json).show("ctl/status", health, lambda: _make_status_table(health))
     return 0
@@ -139,7 +139,9 @@ def send_request(request: ControlRequest, folder: Path, vehicle: str | None) -> 
                 "before arming), or the control loop may hang: watch the vehicle"
             ) from error
         except msgspec.MsgspecError as error:
-            raise NotReachedError(f"the answer is not understood ({error}); is the daemon of this version?") from error
+            raise NotReachedError(
+                f"the answer is not understood ({error}); does the daemon have this version?"
+            ) from error
 
 
 def _connect_daemon(folder: Path, vehicle: str | None) -> socket.socket:
@@ -214,7 +216,7 @@ def describe_relay(relay: RelayHealth) -> str:
     """Describe how the vehicle gets its positions, also after the end of control."""
     if relay.last_s is None:
         return "no position has been passed on yet"
-    suffix = "; control has ended, positions go on" if relay.alone else ""
+    suffix = "; control has ended, positions continue" if relay.alone else ""
     if relay.attitude_fault:
         suffix += f"; {REASONS.get(relay.attitude_fault, relay.attitude_fault)}"
     return f"{relay.sent_hz:.0f} positions a second, {relay.sent} in all, the last {relay.last_s:.1f} s ago{suffix}"
@@ -222,7 +224,7 @@ def describe_relay(relay: RelayHealth) -> str:
 
 def _describe_recorder(recorder: RecorderHealth) -> str:
     """Describe the trouble of the recording."""
-    return f"{'' if recorder.ok else 'in trouble, '}{recorder.dropped} dropped: {recorder.reason or 'the disk is slow'}"
+    return f"{'' if recorder.ok else 'fails, '}{recorder.dropped} dropped: {recorder.reason or 'the disk is slow'}"
 
 
 def _format_point(point: dict[str, float] | None) -> str:

@@ -70,8 +70,8 @@ def _render_gains(comparison: GainComparison, name: str) -> RenderableType:
 
 
 _INFEASIBLE_NOTE = (
-    "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
-    "way of nearer equilibria, or relaxes soft limits."
+    "Infeasible: no plan reaches the target within the horizon and keeps all constraints. A flight takes nearer "
+    "targets first, or relaxes soft limits."
 )
 
 

@@ -236,7 +236,7 @@ def _find_place_problems(document: FleetFile, members: Sequence[Member]) -> Iter
             yield ConfigProblem(
                 "spacing_m",
                 f"the limits of {first.name} and {second.name} are {relation} north and east, "
-                f"{spacing_m:g} m is asked for",
+                f"spacing_m is {spacing_m:g} m",
                 "move sets.state_lower and sets.state_upper of one of them",
             )
 

@@ -61,7 +61,7 @@ def order_stand_by(loop: ControlLoop, flown_ns: int) -> None:
     print_message(
         label_text(
             "warning",
-            "the daemon before this one left the vehicle in flight; if it is still armed, and has not started anew "
+            "an earlier daemon left the vehicle in flight; if the vehicle is still armed, and has not restarted "
             "since, nothing is sent until `uavctl ctl engage`",
             "bold yellow",
         )
@@ -75,7 +75,7 @@ def check_take_off(arm: bool, takeoff: float | None) -> float | None:
         UsageError: One of the two is missing.
     """
     if arm and takeoff is None:
-        raise UsageError("--arm needs --takeoff HEIGHT: on the ground nothing else can be done with an armed vehicle")
+        raise UsageError("--arm needs --takeoff HEIGHT: an armed vehicle on the ground can only take off")
     if takeoff is not None and not arm:
         raise UsageError("--takeoff needs --arm: it permits arming the vehicle")
     return takeoff
@@ -108,7 +108,7 @@ def choose_live_port(*, live: bool, port: int | None) -> int | None:
         UsageError: A port is given without a view.
     """
     if port is not None and not live:
-        raise UsageError(f"--live-port {port} is of the live view; add --live")
+        raise UsageError(f"--live-port {port} belongs to the live view; add --live")
     return (LIVE_PORT if port is None else port) if live else None
 
 
@@ -169,12 +169,12 @@ def print_warning(text: str) -> None:
 
 def report_dead_view(reason: str) -> None:
     """Print that the process of a live view has ended, and the effect."""
-    print_message(label_text("warning", f"the live view has ended: {reason}; the flight goes on"))
+    print_message(label_text("warning", f"the live view has ended: {reason}; the flight continues"))
 
 
 def report_dead_node(reason: str) -> None:
     """Print that the process of a node of ROS 2 has ended, and the effect."""
-    print_message(label_text("warning", f"the node of ROS 2 has ended: {reason}; the flight goes on"))
+    print_message(label_text("warning", f"the node of ROS 2 has ended: {reason}; the flight continues"))
 
 
 def conclude_flight(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
@@ -248,7 +248,7 @@ def run_page_process(module: str, path: Path, page: Path, data: bytes = b"") -> 
         error_lines = process.stderr.decode(errors="replace").strip().splitlines()
         reason = error_lines[-1] if error_lines else f"its process ended with {process.returncode}"
         prefix = "" if str(page) in reason else f"{page}: "
-        raise UavctlError(f"{prefix}{reason}; `uavctl log report {path}` draws the page once that is mended")
+        raise UavctlError(f"{prefix}{reason}; `uavctl log report {path}` draws the page after the repair")
     return process.stdout.decode(errors="replace").strip()
 
 

@@ -82,9 +82,9 @@ def _read_history(flight: Path, common: Common, system: int | None) -> tuple[Fli
             [vehicle for vehicle in recorded.packets if get_system_id(vehicle.data) not in other_systems], tlog_config
         ), config
     if system is not None:
-        raise UsageError("--system is for a .tlog: a recording of ours is of one vehicle")
+        raise UsageError("--system is for a .tlog: a recording of uavctl has one vehicle")
     if common.overrides or common.config != DEFAULTS.config:
-        raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
+        raise UsageError("--config and --set are for a .tlog: a recording of uavctl contains its configuration")
     config = parse_recorded(read_header(flight).config_toml, f"{flight} (configuration)").config
     if cut := explain_missing_end(flight):
         warn(f"{cut}: identified from the part before")

@@ -114,7 +114,7 @@ def parse_sizes(room: str) -> tuple[float, float, float]:
         sizes = []
     if len(sizes) != len(_AXES) or not all(0.0 < size <= MAX_SIZE_M for size in sizes):
         raise UsageError(
-            f"--room {room}: is no room; give length x width x height in metres, each above 0 and at most "
+            f"--room {room}: is not a size; give length x width x height in metres, each above 0 and at most "
             f"{MAX_SIZE_M:g}, as in 6x5x2.5"
         )
     length, width, height = sizes

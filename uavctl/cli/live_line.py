@@ -194,4 +194,4 @@ def _format_recorder_warning(status: RecorderStatus) -> Text:
     """Return a warning on the open recording; empty if there is none."""
     if status.ok:
         return Text(f"  disk gets low: {status.warning}" if status.warning else "", style="yellow")
-    return Text(f"  recording in trouble: {status.reason or f'{status.dropped} records dropped'}", style="bold red")
+    return Text(f"  recording fails: {status.reason or f'{status.dropped} records dropped'}", style="bold red")

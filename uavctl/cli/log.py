@@ -46,7 +46,7 @@ def export(
         Path | None, Parameter(help="folder of the tables, or the .tlog to write; else beside the recording")
     ] = None,
     link: Annotated[str | None, Parameter(help="with tlog: this connection alone, as in vehicle; else all")] = None,
-    force: Annotated[bool, Parameter(negative=(), help="write anew the files that exist")] = False,
+    force: Annotated[bool, Parameter(negative=(), help="overwrite existing files")] = False,
     json: Json = False,
 ) -> int:
     """Write a recording as tables (CSV, or Parquet with uavctl[parquet]), or its raw MAVLink as a .tlog."""

@@ -192,7 +192,7 @@ def _render_report(headline: Headline, summary: RenderableType) -> Group:
 
 def _report_foreign(flight: Path, foreign: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
     if svg is not None:
-        raise UsageError(f"--svg draws a recording of ours; {flight} is none, and of it there is the page")
+        raise UsageError(f"--svg needs a recording of uavctl; {flight} is another one, and has the page only")
     write_tlog_page(foreign, out)
     for note in foreign.info.notes:
         warn(note)

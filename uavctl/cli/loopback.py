@@ -87,7 +87,7 @@ def loopback(
     take_off_m = check_take_off(arm, takeoff)
     view_port = choose_live_port(live=live, port=live_port)
     if live and not udp:
-        raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
+        raise UsageError("--live needs --udp: in virtual time a flight is too short for a viewer")
     overrides = [*make_key_overrides(duration_s=duration, sim__seed=seed), *make_goto_overrides(goto)]
     summary = fly_simulated(
         common.with_overrides(overrides).load(),
@@ -172,7 +172,7 @@ def _warn_of_slow_answers(config: Config, summary: FlightSummary) -> None:
         return
     warn(
         f"{config.smpc.controller} took {median_us * 1e-3:.0f} ms (median; largest {largest_us * 1e-3:.0f} ms) in "
-        f"virtual time; a flight in real time would end on it: a tick lasts {config.daemon.tick_s * 1e3:g} ms"
+        f"virtual time; a flight in real time would end for this: a tick lasts {config.daemon.tick_s * 1e3:g} ms"
     )
 
 

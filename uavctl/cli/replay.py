@@ -44,8 +44,8 @@ def replay(
         return _replay_foreign(flight, packets, common)
     if common.config != DEFAULTS.config or topic or system is not None:
         raise UsageError(
-            "--config, --topic and --system are for another program's recording: one of ours is replayed with its own "
-            "configuration, of which --set changes a key"
+            "--config, --topic and --system are for another program's recording. A recording of uavctl is replayed "
+            "with its own configuration; --set changes a key"
         )
     replayed = replay_flight(flight, tolerance, common.overrides)
     for text in _list_warnings(replayed):
@@ -55,6 +55,7 @@ def replay(
         **msgspec.structs.asdict(result),
         "changed": replayed.changed,
         "other_versions": replayed.other_versions,
+        "texts_compared": not replayed.has_other_texts,
     }
     common.show("log/replay", document, lambda: make_replay_table(replayed))
     return 0 if result.identical else 1
@@ -64,6 +65,8 @@ def _list_warnings(replayed: ReplayOutcome) -> Iterator[str]:
     """Return the limits of the comparison."""
     result = replayed.result
     yield from (f"{text}: decisions may differ" for text in replayed.other_versions)
+    if replayed.has_other_texts:
+        yield "texts of events and reasons are of another version, and are not compared"
     if result.dropped:
         yield f"{count(result.dropped, 'record')} missing in the recording: later ones cannot be compared"
     if replayed.holes:

@@ -74,7 +74,7 @@ def _describe_context(context: Context) -> Iterator[tuple[str, object]]:
         f"vehicle {context.vehicle}" if context.vehicle else "no vehicle heard",
         *([f"orders {', '.join(context.orders)}"] if context.orders else []),
         *([f"{context.missed_ticks} ticks missed before it"] if context.missed_ticks else []),
-        *(["the hand-over is asked for"] if context.stop else []),
+        *(["the operator ended the flight"] if context.stop else []),
     ]
     yield "inputs of that tick", "; ".join(inputs)
     if context.recorded is not None and context.recorded == context.replayed:

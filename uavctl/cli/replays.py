@@ -12,7 +12,7 @@ import msgspec
 from logs.recording.foreign import read_foreign_packets
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import explain_missing_end, read_header, read_kind, read_last_note, read_messages
-from logs.recording.replay import LAST_BITS, MAKERS, ReplayResult
+from logs.recording.replay import LAST_BITS, MAKERS, TEXTS, ReplayResult
 from logs.recording.replay import replay as replay_recording
 from logs.recording.senders import choose_vehicle
 from logs.recording.tlog import TlogPacket
@@ -25,7 +25,7 @@ from uavctl.config.load import parse_recorded
 from uavctl.errors import DesignError, RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import make_links
-from uavctl.records import Header, StepInput
+from uavctl.records import TEXT_VERSION, Header, StepInput
 from uavctl.wiring.controller import (
     ARITHMETIC_NAME,
     CONTROLLER,
@@ -53,7 +53,7 @@ def make_recorded_controller(flight: Path, config: Config) -> Prepared:
             raise
         flown_controller = read_header(flight).versions.get(CONTROLLER, config.smpc.controller)
         raise RecordingError(
-            f"{flight}: was flown by a controller of another package, {flown_controller}, which is not here: "
+            f"{flight}: was flown by a controller of another package, {flown_controller}, which is not installed: "
             f"{error.reason}; {error.hint}"
         ) from error
 
@@ -86,6 +86,7 @@ class ReplayOutcome:
     changed: tuple[ChangedKey, ...]  # changed keys of the configuration
     other_versions: tuple[str, ...]  # versions that decide the last bits and differ from the recording's
     tolerance: float  # largest relative difference that counts as none
+    has_other_texts: bool = False  # texts of events and reasons are of another version, and are not compared
 
 
 def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str] = ()) -> ReplayOutcome:
@@ -124,7 +125,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     elif recorded.library_id is not None:
         raise RecordingError(
             f"{flight}: was flown with a policy library, which this version does not have; replay it with "
-            f"{_LIBRARY_VERSION}, or decide it anew with --set solver.method=exact"
+            f"{_LIBRARY_VERSION}, or decide again with --set solver.method=exact"
         )
     else:
         controller, changed = make_recorded_controller(flight, config).controller, ()
@@ -133,6 +134,9 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     ignored = MAKERS if overrides or (config.is_age_conditioned and "scheme" not in recorded.design) else frozenset()
     if tolerance:
         ignored |= LAST_BITS
+    has_other_texts = recorded.text_version != TEXT_VERSION
+    if has_other_texts:
+        ignored |= TEXTS
     result = replay_recording(
         ((message.definition.topic, message.at_ns, message.data) for message in read_messages(flight)),
         lambda sink: ControlLoop(config, controller, sink, lambda: 0),
@@ -142,7 +146,13 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         moved_inputs=recorded.moved_inputs,
     )
     return ReplayOutcome(
-        result, end_problem, hole_text, changed, find_other_versions(recorded, flown_config.smpc.controller), tolerance
+        result,
+        end_problem,
+        hole_text,
+        changed,
+        find_other_versions(recorded, flown_config.smpc.controller),
+        tolerance,
+        has_other_texts,
     )
 
 

@@ -42,7 +42,7 @@ def tune(
     config: Annotated[str, Parameter(help="preset or TOML file that is to be tuned; it is never written to")],
     /,
     *,
-    folder: Annotated[Path, Parameter(help="of the run; given again, the run goes on after its last finished step")],
+    folder: Annotated[Path, Parameter(help="of the run; the same folder continues after the last complete step")],
     box: Annotated[
         str | None,
         Parameter(
@@ -52,9 +52,7 @@ def tune(
     ] = None,
     flight: Annotated[
         Path | None,
-        Parameter(
-            help="begin with this recording of ours instead; its mission is flown again", validator=check_readable
-        ),
+        Parameter(help="begin with this recording instead; its mission is flown again", validator=check_readable),
     ] = None,
     loopback: Annotated[
         bool, Parameter(negative=(), help="fly the simulator in this process, in virtual time")
@@ -80,9 +78,9 @@ def tune(
     if (box is None) == (flight is None):
         raise UsageError("give --box, to excite the vehicle inside, or --flight, to begin with a recording")
     if not loopback and seed is not None:
-        raise UsageError("--seed is of the simulator; add --loopback")
+        raise UsageError("--seed belongs to the simulator; add --loopback")
     if loopback and not (vehicle is None and mocap is None):
-        raise UsageError("--vehicle and --mocap are of a real vehicle; leave them out with --loopback")
+        raise UsageError("--vehicle and --mocap belong to a real vehicle; leave them out with --loopback")
     common = Common(config, overrides, json)
     plant = ("sim.plant=quadrotor",) if loopback and not _chooses_plant(common) else ()
     keys = make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap, sim__seed=seed)

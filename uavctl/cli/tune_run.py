@@ -161,15 +161,15 @@ def _fly(request: TuneRequest, config: Config, name: str, brake_share: float) ->
     """Fly a mission, unless the newest attempt is complete; return its recording.
 
     Raises:
-        TuneStoppedError: The flight did not come to its end, or nobody agreed to it.
+        TuneStoppedError: The flight is not complete, or was not confirmed.
     """
     newest, free = find_attempts(request.folder, name)
     if newest is not None and (recording := find_complete_flight(config, newest)) is not None:
-        print_message(f"the flight in {newest} came to its end, and counts", style="dim")
+        print_message(f"the flight in {newest} is complete and counts", style="dim")
         return recording
     _announce_flight(request, name)
     if name == AFTER_FOLDER and not request.is_agreed and not ask_agreement():
-        raise TuneStoppedError(TuneExit.INTERRUPTED, "the second flight was not agreed to")
+        raise TuneStoppedError(TuneExit.INTERRUPTED, "the second flight was not confirmed")
     if not request.simulated and request.box is not None:
         check_start(request.box, measure_position(request.config), "where the vehicle stands", _HORIZONTAL)
     flight = fly_once(
@@ -196,7 +196,7 @@ def _describe_end(flight: TuneFlight) -> str:
     is_unnamed = flight.end is TuneEnd.OPERATOR and flight.summary.ending.code != Cause.ENDED_BY_OPERATOR
     sentence = flight.summary.ending.sentence.removesuffix(".")
     prefix = "Ended by the operator. " if is_unnamed else ""
-    return f"{prefix}{sentence}. The flight did not come to its end ({flight.recording})"
+    return f"{prefix}{sentence}. The flight is not complete ({flight.recording})"
 
 
 def _announce_flight(request: TuneRequest, name: str) -> None:
@@ -245,8 +245,8 @@ def open_folder(path: Path, mission: Config) -> None:
     elif read_text(settings) != text:
         differences = "; ".join(_describe_differences(read_text(settings), text)) or "other values"
         raise UsageError(
-            f"--folder {path}: is a run of another configuration or box ({differences}). Give that one to go on, or "
-            "choose another folder"
+            f"--folder {path}: is a run of another configuration or box ({differences}). Give these to continue, "
+            "or choose another folder"
         )
 
 

@@ -93,16 +93,16 @@ def whatif(
         Parameter(
             negative=(),
             metavar="recorded|configured|KEY=VALUE",
-            help="how positions come: as recorded; over a simulated link as in [link]; or over that with a key of it "
-            "changed, as in loss=0.5, which the design does not know; may be repeated. Else as recorded, unless --set "
-            "changes a key of link",
+            help="link of the positions: recorded; configured, simulated as in [link]; or KEY=VALUE, a changed key "
+            "that the design does not know, as in loss=0.5 (may be repeated). Default: recorded, unless --set changes "
+            "a key of link",
         ),
     ] = (),
     seed: Annotated[
         int | None, Parameter(help="seed of a simulated link; else the recorded sim.seed", validator=SEED)
     ] = None,
     model: Annotated[
-        Path | None, Parameter(help="TOML file whose [plant] answers to other setpoints, as of `uavctl identify`")
+        Path | None, Parameter(help="TOML file with the [plant] of the vehicle, as `uavctl identify` writes it")
     ] = None,
     out: Annotated[Path | None, Parameter(help="folder of the recording; else a new one below flights/")] = None,
     json: Json = False,
@@ -115,7 +115,7 @@ def whatif(
         )
     link_name = _choose_link(link, overrides)
     if seed is not None and link_name == RECORDED:
-        raise UsageError("--seed is of a simulated link; add --link configured, or --link KEY=VALUE")
+        raise UsageError("--seed belongs to a simulated link; add --link configured, or --link KEY=VALUE")
     check_first_file(flight)
     link_keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
     result = fly_what_if(WhatIfRequest(flight, config, overrides, controller, link_name, link_keys, seed, model, out))

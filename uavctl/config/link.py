@@ -142,7 +142,7 @@ def read_trace_file(link: LinkConfig, folder: Path, problems: list[ConfigProblem
     try:
         delays = _read_delays(path)
     except DataFileError as error:
-        problems.extend(ConfigProblem(key, reason, "mend the file") for reason in error.reasons)
+        problems.extend(ConfigProblem(key, reason, "correct the file") for reason in error.reasons)
         return link, {}
     return msgspec.structs.replace(link, trace_file="", trace_s=delays), {"link.trace_s": str(path)}
 

@@ -230,7 +230,7 @@ def _parse(table: dict[str, Any], text: str, file: str, overrides: Sequence[str]
     problems.extend(check_sections(sections))
     messages.extend(source.describe(problem) for problem in problems[:_MAX_PROBLEMS])
     if len(problems) > _MAX_PROBLEMS:
-        messages.append(f"{file}: {len(problems) - _MAX_PROBLEMS} more; mend these first")
+        messages.append(f"{file}: {len(problems) - _MAX_PROBLEMS} more; correct these first")
     if messages or config is None:
         raise ConfigError(tuple(messages))
     return LoadedConfig(msgspec.structs.replace(cast("Config", config), mission=mission, link=link), source)
@@ -366,7 +366,7 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
     """
     excess = find_excess(text)
     if excess is not None:
-        raise ConfigError((f"{file}:{excess[0]}: {excess[1]}; mend the file",))
+        raise ConfigError((f"{file}:{excess[0]}: {excess[1]}; correct the file",))
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -382,9 +382,9 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
             raise ConfigError(
                 (f"{file}:{second_line}: {key}: is given again, first in line {first_line}; keep one of the two",)
             ) from error
-        raise ConfigError((f"{file}:{line}: TOML syntax: {reason}; mend the line",)) from error
+        raise ConfigError((f"{file}:{line}: TOML syntax: {reason}; correct the line",)) from error
     except ValueError as error:  # a whole number of thousands of digits
-        raise ConfigError((f"{file}:1: TOML: {error}; mend the number",)) from error
+        raise ConfigError((f"{file}:1: TOML: {error}; correct the number",)) from error
 
 
 def parse_stored_toml(text: str, file: str) -> dict[str, Any]:

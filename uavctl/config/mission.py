@@ -116,7 +116,7 @@ def read_trajectory_file(
     try:
         rows = _read_rows(path)
     except DataFileError as error:
-        problems.extend(ConfigProblem(key, reason, "mend the file") for reason in error.reasons)
+        problems.extend(ConfigProblem(key, reason, "correct the file") for reason in error.reasons)
         return mission, {}
     samples = msgspec.structs.replace(
         trajectory,

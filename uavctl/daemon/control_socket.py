@@ -170,7 +170,7 @@ class ControlServer:
     def close(self) -> None:
         """End the service; clients that still wait get a refusal."""
         for client, _ in self._pending:
-            self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
+            self._reply(client, Reply(ok=False, text="the flight ended before a decision on this order"))
         for client in self._clients:
             client.socket.close()
         self._clients.clear()
@@ -181,7 +181,7 @@ class ControlServer:
         for client, command in waiting:
             answer = next((pair for pair in answers if pair[0] == command), None)
             if answer is None:
-                self._reply(client, Reply(ok=False, text="the flight gave no answer to this"))
+                self._reply(client, Reply(ok=False, text="the flight did not answer this order"))
             else:
                 answers.remove(answer)
                 self._reply(client, Reply(ok=answer[1].code == EventCode.ORDER_ACCEPTED, text=answer[1].text))
@@ -315,7 +315,7 @@ def _prepare_folder(folder: Path) -> None:
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
         raise UsageError(f"{folder}: not a folder of this user; choose another one with --control")
     if status.st_mode & 0o077:
-        raise UsageError(f"{folder}: others may enter it, and could give orders; run: chmod 700 {folder}")
+        raise UsageError(f"{folder}: other users can enter it and give orders; run: chmod 700 {folder}")
 
 
 def _listen(path: Path, name: str) -> socket.socket:
@@ -325,7 +325,7 @@ def _listen(path: Path, name: str) -> socket.socket:
             is_listening = _is_listening(path)
         except OSError as error:
             raise UsageError(
-                f"{path}: {error.strerror}: another user, root it may be, left it; if no daemon of theirs flies, "
+                f"{path}: {error.strerror}: another user (perhaps root) left it; if no daemon of that user flies, "
                 f"run: sudo rm {path}"
             ) from error
         if is_listening:

@@ -252,11 +252,11 @@ class _Flight:
         connection = self._connections[VEHICLE]
         if connection.closed:
             self._loop.account.note_closed_connection(
-                f"{connection.url}; nothing can be sent, and its own failsafe has it"
+                f"{connection.url}; nothing can be sent, and the vehicle's own failsafe acts"
             )
             raise ConnectionClosedError(
-                f"{connection.url}: closed by the other side, so nothing can be sent; "
-                "the vehicle's own failsafe has it. See to the link and start again"
+                f"{connection.url}: the other side closed the connection, so nothing can be "
+                "sent; the vehicle's own failsafe acts. Check the link and start again"
             )
 
     def _report_error(self, subject: str, error: Exception) -> None:

@@ -146,7 +146,7 @@ class HealthMonitor:
         self._missed = 0
         self._max_lateness_ns = 0  # of this second
         self._previous_max_lateness_ns = 0  # of the last one
-        self._recording_state = "well"  # as last reported
+        self._recording_state = "works"  # as last reported
         self._breach_reason = ""  # the same
         self._inertial = (0, 0)  # data used and all, at the last second
         self._inertial_share: float | None = None
@@ -189,12 +189,12 @@ class HealthMonitor:
 
     def _report_recorder(self, recorder: RecorderHealth) -> None:
         """Report each change of the recording's health once, in a line of its own."""
-        state = "in trouble" if not recorder.ok else "may not go on for long" if recorder.reason else "well"
+        state = "fails" if not recorder.ok else "may stop soon" if recorder.reason else "works"
         if state == self._recording_state:
             return
         self._recording_state = state
         reason = recorder.reason or f"{recorder.dropped} records dropped"
-        self._write_line("recording is well again" if state == "well" else f"warning: recording {state}: {reason}")
+        self._write_line("recording works again" if state == "works" else f"warning: recording {state}: {reason}")
 
     def make_health(self) -> Health:
         """Make the present state of the flight."""

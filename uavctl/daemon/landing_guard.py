@@ -95,7 +95,7 @@ def guard_landing(
     try:
         helper = HelperProcess("uavctl.daemon.landing_host", [str(argument) for argument in arguments], stderr=None)
     except OSError as error:
-        report(f"no process that lands the vehicle if this one dies ({error.strerror})")
+        report(f"no guard process: nothing requests landing if this process dies ({error.strerror})")
         yield ()
         return
     guard = LandingGuard(helper, loop, connection, round(hand_over.answer_s * SECOND_NS))

@@ -118,11 +118,15 @@ def main(arguments: list[str]) -> int:
         if not feed.wait_for_death(flight):
             return 0
     if feed.landing.requests and feed.descriptor >= 0:
-        _tell("error: the flight's process has ended in the air; landing is asked for")
+        _tell("error: the flight's process has ended in the air; landing is requested")
         land(feed.landing, feed.descriptor, request)
-        _tell("ended: the vehicle lands, or another controller has it" if request.is_answered else "ended: no answer")
+        _tell(
+            "ended: the vehicle is landing, or another controller flies it"
+            if request.is_answered
+            else "ended: no answer"
+        )
     else:
-        _tell("error: the flight's process has ended; no landing is asked for")
+        _tell("error: the flight's process has ended; landing is not requested")
     _tell(f"recording: `uavctl log report {recording}` shows how far the recording goes, and draws its page")
     return 0
 

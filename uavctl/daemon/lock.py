@@ -168,8 +168,8 @@ def _lock_file(path: Path, url: str) -> int:
             continue  # made by another one in between
         except PermissionError as error:
             raise VehicleTakenError(
-                f"{path}: is not this user's, so nothing shows that {url} is free; another user, root it may be, left "
-                f"it; if nothing of theirs flies, run: sudo rm {path}"
+                f"{path}: belongs to another user (perhaps root), so nothing shows that {url} is free; "
+                f"if that user flies nothing, run: sudo rm {path}"
             ) from error
         except OSError as error:
             raise VehicleTakenError(
@@ -215,5 +215,5 @@ def _make_taken_error(descriptor: int, url: str) -> VehicleTakenError:
     holder = f"process {pid}" if pid.isdecimal() else "another process"
     alias = f" (as {their_url})" if their_url and their_url != url else ""
     return VehicleTakenError(
-        f"{url}: {holder} flies this vehicle already{alias}; end it first, or fly another vehicle with --vehicle"
+        f"{url}: {holder} already flies this vehicle{alias}; end it first, or fly another vehicle with --vehicle"
     )

@@ -25,7 +25,7 @@ _NOT_FLOWN = (ControlMode.WAIT, ControlMode.LAND, ControlMode.STOPPED)  # modes 
 
 # Without setpoints a vehicle flies by its own failsafe soon: PX4's documentation requires two setpoints a second.
 GAP_NS = 500_000_000
-AFTER_GAP = f"no tick has run for more than {GAP_NS * 1e-9:g} s, and no heartbeat has shown the vehicle's mode since"
+AFTER_GAP = f"the control loop paused for more than {GAP_NS * 1e-9:g} s, and no heartbeat has come since"
 
 
 class TickContext(msgspec.Struct, frozen=True, eq=False):

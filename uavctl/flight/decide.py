@@ -72,13 +72,13 @@ AFTER_HOLD_NS, AFTER_HOLD_MPS2 = 1_500_000_000, 0.7
 # show that they err. With five positions a second and 60 % of them lost, one in ten is older.
 MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
-BESIDE_OBSTACLE = "a vehicle that is free may come near: landing is asked for"
+BESIDE_OBSTACLE = "a vehicle without a cell may come near: landing"
 _FINAL_TEXTS = {
-    FallbackReason.VELOCITY_WRONG: "the vehicle's own velocity was found wrong or has stopped, and nothing replaces it",
+    FallbackReason.VELOCITY_WRONG: "the vehicle's velocity estimate is wrong or missing, and nothing replaces it",
     FallbackReason.CONTROLLER_FAILED: "the controller has failed",
-    FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
-    FallbackReason.ENVELOPE: "what is seen cannot be",
-    FallbackReason.STOP: "the operator asked for the hand-over",
+    FallbackReason.POSITIONS_DISTRUSTED: "positions jumped and did not agree again",
+    FallbackReason.ENVELOPE: "sensor data contradict each other",
+    FallbackReason.STOP: "the operator ended the flight",
     FallbackReason.LAND: "landing is due",
 }
 
@@ -211,7 +211,7 @@ def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
     inputs, why_not = phase.context.inputs, phase.context.not_ready_reason
     at_ns, fallback = phase.context.at_ns, draft.fallback
     if fallback is not None and fallback.is_over:
-        return _fall_back(draft, fallback, phase, "handed over")
+        return _fall_back(draft, fallback, phase, "the vehicle has been handed over")
     if phase.context.awaits_heartbeat:
         # Its own failsafe may have the vehicle. A setpoint would end that of PX4.
         due = fallback if fallback is not None and fallback.is_final else None
@@ -219,7 +219,7 @@ def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
     is_stopped = inputs.stop or (fallback is not None and fallback.reason is FallbackReason.STOP)
     if why_not and is_stopped:
         ended = Fallback(mode=ControlMode.STOPPED, since_ns=at_ns, reason=FallbackReason.STOP)
-        return replace(draft, plan=None, fallback=ended, reason=f"the operator stopped; {why_not}")
+        return replace(draft, plan=None, fallback=ended, reason=f"the operator ended the flight; {why_not}")
     if inputs.vehicle is None and draft.mode is not ControlMode.WAIT:
         return _wait_for_vehicle(draft, fallback or begin_fallback(at_ns), phase)
     if why_not:
@@ -246,27 +246,27 @@ def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
     """Decide for a vehicle that takes setpoints, with nothing against a plan."""
     if not phase.context.is_boundary:
         if draft.fallback is not None:
-            return _fall_back(draft, draft.fallback, phase, "fallback goes on")
+            return _fall_back(draft, draft.fallback, phase, "the fallback continues")
         waiting = draft.plan is None
-        return replace(draft, reason="waits for the next boundary" if waiting else "held until the next boundary")
+        return replace(draft, reason="waiting for the next step" if waiting else "the input stays until the next step")
     view, controller, at_ns = phase.view, phase.controller, phase.context.at_ns
     if view.age_steps is None:
         never = view.estimate is None
-        return replace(draft, reason="no position yet" if never else "no position from before this boundary yet")
+        return replace(draft, reason="no position yet" if never else "no position from before this step yet")
     if view.age_steps >= controller.horizon:
-        reason = f"age of information {view.age_steps} has reached H = {controller.horizon}"
+        reason = f"the newest position is {view.age_steps} steps old, and plans last {controller.horizon} steps"
         return _fall_back(draft, draft.fallback or begin_fallback(at_ns), phase, reason)
     wanted = phase.wanted_samples
     if draft.fallback is not None and are_positions_compared(phase.context, phase.supervised):
-        reason = "positions have come back, and are compared with the vehicle's velocity"
+        reason = "positions are back, and must agree with the vehicle's velocity estimate first"
         is_fresh = draft.consecutive_samples >= wanted
         fallback = restart_hold(draft.fallback, at_ns) if is_fresh else draft.fallback
         return _fall_back(draft, fallback, phase, reason)
     if draft.fallback is not None and draft.consecutive_samples < wanted:
-        reason = f"{draft.consecutive_samples} of {wanted} fresh samples in a row"
+        reason = f"{draft.consecutive_samples} of {wanted} new positions in a row"
         return _fall_back(draft, draft.fallback, phase, reason)
     if phase.supervised.plan_base is None:
-        return replace(draft, reason="no estimate of this boundary")
+        return replace(draft, reason="no estimate for this step")
     return _plan_from(draft, phase.supervised.plan_base, phase)
 
 
@@ -292,7 +292,7 @@ def _plan_from(draft: Decided, belief: Belief, phase: _Phase) -> Decided:
         return _give_up_controller(planned, phase)
     if planned.plan is not None and context.step - planned.plan.seq < controller.horizon:
         return planned
-    return _fall_back(planned, draft.fallback or begin_fallback(context.at_ns), phase, "no plan is left to fly")
+    return _fall_back(planned, draft.fallback or begin_fallback(context.at_ns), phase, "no plan is left")
 
 
 def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, phase: _Phase) -> Decided:
@@ -303,13 +303,13 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
     before_cells = draft.cells
     draft = _choose_cell_by_plan(draft, phase)
     if new_measurement:
-        reason = "news: a new plan"
+        reason = "new position: new plan"
     elif _has_new_inertial(draft.plan, phase):
-        reason = "inertial data: a new plan"
+        reason = "new IMU data: new plan"
     elif draft.cells is not before_cells or draft.cells.pending is not None:
-        reason = "a new cell: a new plan"
+        reason = "new cell: new plan"
     else:
-        return replace(draft, reason="no news: the plan plays out")
+        return replace(draft, reason="no new position: the plan continues")
     if draft.order is not None:
         reason = f"{reason}, as ordered: {describe_order(draft.order)}"
     mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
@@ -327,7 +327,7 @@ def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, p
         draft, asked = _plan_in_cell(draft, base, target if is_first else None, preview, phase)
     draft = replace(draft, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
     if asked.plan is None:
-        reason = "no new plan: the old one plays out"
+        reason = "no new plan: the old plan continues"
         return replace(draft, reason=reason, fault=asked.fault, trouble=asked.text)
     return replace(
         draft,
@@ -466,7 +466,7 @@ def _fall_back(draft: Decided, fallback: Fallback, phase: _Phase, reason: str) -
     before, fallback = fallback, _advance(draft, fallback, phase)
     if fallback.mode is ControlMode.LAND and not fallback.is_final:
         held_s = (phase.context.at_ns - (before.held_ns or phase.context.at_ns)) * 1e-9
-        reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
+        reason = f"held for {held_s:.1f} s without positions: landing"
     consecutive = 0 if draft.fallback is None else draft.consecutive_samples
     hold_point_m = None
     if fallback.mode is ControlMode.HOLD:
@@ -491,14 +491,14 @@ def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Deci
     )
     consecutive = 0 if draft.fallback is None else draft.consecutive_samples
     if later.is_over:
-        reason = f"{unheard}, and the time to hold is over: its own failsafe is left to act"
+        reason = f"{unheard}, and the hold time is over: the vehicle's own failsafe must act"
         due = fallback
         if not fallback.is_final:
             due = Fallback(mode=fallback.mode, since_ns=fallback.since_ns, reason=FallbackReason.LAND)
         return replace(
             draft, plan=None, fallback=due, consecutive_samples=consecutive, reason=reason, sends_nothing=True
         )
-    reason = f"{unheard}; the fallback's time runs on"
+    reason = f"{unheard}; the fallback continues"
     return replace(draft, plan=None, fallback=later, consecutive_samples=consecutive, reason=reason)
 
 

@@ -38,21 +38,29 @@ SILENT_NS = 1_000_000_000  # without inertial data
 ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for and begin
 
 _LINK_TEXTS: dict[str, str] = {
-    EventCode.LINK_BURSTS: "positions are lost in bursts: silence is longer than independent losses would make it",
+    EventCode.LINK_BURSTS: "Positions are lost in bursts. Gaps are longer than independent losses would cause.",
     EventCode.LINK_BELOW_DESIGN: (
-        "fewer positions arrive in time than the design counts on; limits may be broken more often"
+        "Fewer positions arrive in time than the design expects. The vehicle may exceed limits more often."
     ),
+}
+_REFUSED_TEXTS: dict[str, str] = {
+    EventCode.SAMPLE_DUPLICATE: "received twice",
+    EventCode.SAMPLE_TOO_OLD: "too old",
+    EventCode.SAMPLE_INVALID: "a value is not finite, or impossibly large",
+    EventCode.SAMPLE_FUTURE: "the stamp lies in the future",
+    EventCode.SAMPLE_FROZEN: "the value repeats although the vehicle moves",
+    EventCode.SAMPLE_JUMP: "the vehicle cannot have moved so far",
 }
 _INERTIAL_TEXTS: dict[str, tuple[Severity, str]] = {
     EventCode.INERTIAL_DOUBTED: (
         Severity.WARNING,
-        "the vehicle's inertial data contradict its positions, its own velocity or its model: they are not used",
+        "The IMU data contradict positions, velocity or the model. The controller ignores them.",
     ),
     EventCode.INERTIAL_SILENT: (
         Severity.WARNING,
-        "no inertial data of the vehicle that are of now: flown by its model alone",
+        "No current IMU data arrive. The controller relies on the model alone.",
     ),
-    EventCode.INERTIAL_USED: (Severity.INFO, "the vehicle's inertial data are used"),
+    EventCode.INERTIAL_USED: (Severity.INFO, "The controller uses IMU data again."),
 }
 _ENTERED = {
     ControlMode.WAIT: (Severity.WARNING, EventCode.DISENGAGED),
@@ -121,7 +129,7 @@ def _report_faults(
     """Report a new start of the filter, a breach of the envelope, and a controller that is given up."""
     at_ns, breach = context.at_ns, supervised.breach
     if measured.restarted:
-        text = "positions jumped while nobody flew on them; the estimate begins anew"
+        text = "Positions jumped while the controller did not fly. The estimate starts again."
         yield _make_event(at_ns, Severity.WARNING, EventCode.POSITION_RESTART, text)
     if breach is not None and breach.cause is not None:
         yield _make_event(at_ns, Severity.ERROR, breach.cause.value, breach.text)
@@ -134,17 +142,19 @@ def _report_samples(context: TickContext, measured: Measured) -> Iterable[Event]
     at_ns, refused = context.at_ns, [why for _, why in measured.samples.refused]
     for code in sorted(set(refused)):
         if code != EventCode.SAMPLE_REPEATED:  # some sources send each value twice
-            text = "the sample counts as lost"
-            yield _make_event(at_ns, Severity.WARNING, code, text, refused.count(code))
+            count = refused.count(code)
+            text = f"Ignored {count} position{'' if count == 1 else 's'}: {_REFUSED_TEXTS[code]}."
+            yield _make_event(at_ns, Severity.WARNING, code, text, count)
     if context.inputs.missed_ticks:
-        text = "ticks were missed; they are not made up for"
-        yield _make_event(at_ns, Severity.WARNING, EventCode.MISSED_TICKS, text, context.inputs.missed_ticks)
+        missed = context.inputs.missed_ticks
+        text = f"The control loop ran late and skipped {missed} cycle{'' if missed == 1 else 's'}."
+        yield _make_event(at_ns, Severity.WARNING, EventCode.MISSED_TICKS, text, missed)
 
 
 def _report_delay(before: SmoothingTrack, now: SmoothingTrack, at_ns: int) -> Iterable[Event]:
     """Report a delay of positions where it begins to count."""
     if now.late_s and not before.late_s:
-        text = f"positions are smoothed, or late by {now.late_s:.2f} s beside their stamps: this is counted in"
+        text = f"Positions are smoothed, or {now.late_s:.2f} s older than their stamps. The controller corrects this."
         yield _make_event(at_ns, Severity.WARNING, EventCode.POSITIONS_LATE, text)
 
 
@@ -250,12 +260,12 @@ def report_bias(push_mps2: Vec3, before: Sequence[int], now: Sequence[int], at_n
     if set(now) - set(before):
         pushes = ", ".join(f"{value:+.2f}" for value in push_mps2)
         text = (
-            f"a lasting push, as wind, is as large as what may be flown against it ({pushes} m/s² north, east, down): "
-            "what it is more carries the vehicle off its target"
+            f"A lasting push of {pushes} m/s² (north, east, down), such as wind, has reached the largest compensation. "
+            "A stronger push moves the vehicle away from its target."
         )
         return (_make_event(at_ns, Severity.WARNING, EventCode.BIAS_AT_BOUND, text),)
     if before and not now:
-        text = "the lasting push is again within what may be flown against it"
+        text = "The lasting push is small enough again to be compensated."
         return (_make_event(at_ns, Severity.INFO, EventCode.BIAS_FREE, text),)
     return ()
 

@@ -84,21 +84,21 @@ def _find_refusal(ordered: Ordered, command: Command, context: TickContext) -> s
         # A fallback flies on while the vehicle is silent, and lands when it is heard again.
         return "" if context.inputs.vehicle is None and fallback is not None else context.not_ready_reason
     if fallback is not None and fallback.is_final:
-        return "the vehicle is on its way down"
+        return "the vehicle is landing"
     if command.order is Order.RESUME:
         left = ordered.mission is not None and ordered.mission.stay is not None
         waits = ordered.order is not None and ordered.order.order is not Order.RESUME
-        return "" if left or waits else "the mission was not left"
+        return "" if left or waits else "the mission is already being flown"
     if mission.rest_region is None:
-        return "there are places where this plant cannot rest"
+        return "this plant cannot rest at every place"
     return "" if command.order is Order.HOLD else _find_place_refusal(command.position_m, mission.rest_region)
 
 
 def _find_place_refusal(position_m: Vec3 | None, region: RestRegion) -> str:
     if position_m is None:
-        return "there is no place to go to"
+        return "no place was given"
     if not all(map(math.isfinite, position_m)):
-        return "the place is not finite"
+        return "the place has a coordinate that is not a number"
     return region.describe_refusal(position_m)
 
 

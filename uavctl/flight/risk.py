@@ -152,8 +152,8 @@ def report_saturation(before: RiskGroup, now: RiskGroup, context: TickContext) -
     if parameters is None or not parameters.adapts or before.loop.is_saturated or not now.loop.is_saturated:
         return ()
     text = (
-        "the vehicle was outside of its limits more often than allowed, and plans keep as far away from them as they "
-        "may: the promise does not hold here"
+        "The vehicle left its limits more often than allowed. Plans already keep the largest distance from them. "
+        "The promised risk does not hold."
     )
     return (Event(at_ns=context.at_ns, severity=Severity.WARNING, code=EventCode.RISK_SATURATED, text=text),)
 

@@ -42,7 +42,7 @@ def ask_solver(
     except SOLVER_ERRORS as error:
         return SolveOutcome(SolveStatus.FAILED, None, f"the solver raised {in_words(error)}")
     if answer.seq != seq:
-        return SolveOutcome(SolveStatus.LATE, None, f"the answer is to step {answer.seq}, asked was step {seq}")
+        return SolveOutcome(SolveStatus.LATE, None, f"the answer is for step {answer.seq}, not for step {seq}")
     if answer.status is not SolveStatus.OPTIMAL:
         text = "" if answer.fault else f"the solve ended as {answer.status.value}"
         return SolveOutcome(answer.status, None, text, answer.fault)

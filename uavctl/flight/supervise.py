@@ -88,22 +88,21 @@ RETURNED_NS = 4_000_000_000
 PLAYED_OUT_STEPS = 2  # without a position: from there on a prediction is compared with the vehicle's own velocity
 REPLAN_STEPS = 3  # for which a plan is made anew once positions were dropped: the setpoint is slew-limited
 
-_ABSURD = end_plans(EventCode.OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
-_JUMPED = brake(EventCode.SAMPLE_JUMP, "positions jumped: braking until they are believed again, or not any more")
+_ABSURD = end_plans(EventCode.OUTSIDE, "all positions are impossibly far away, as if in another unit")
+_JUMPED = brake(EventCode.SAMPLE_JUMP, "positions jumped: braking until they agree again, or count as wrong for good")
 _CONTRADICTED = brake(
     EventCode.PREDICTION_INCONSISTENT,
-    "the vehicle's velocity and its inertial data contradict each other, and no position comes",
+    "the vehicle's velocity estimate and IMU data contradict each other, and no position arrives",
 )
 _POSITIONS_CONTRADICTED = brake(
-    EventCode.PREDICTION_INCONSISTENT,
-    "positions contradict both the vehicle's velocity and its inertial data, which change alike",
+    EventCode.PREDICTION_INCONSISTENT, "positions contradict the vehicle's velocity estimate and IMU data, which agree"
 )
 _CARRIED_BY_NOTHING = brake(
-    EventCode.PREDICTION_INCONSISTENT, "no position comes, and inertial data do not either, or are doubted"
+    EventCode.PREDICTION_INCONSISTENT, "no position arrives, and IMU data are missing or contradicted"
 )
 _ABSURD_SO_FAR = brake(
     EventCode.POSITIONS_ABSURD,
-    "positions are further out than any can be: braking until they are believed again, or not any more",
+    "positions are impossibly far away: braking until they agree again, or count as wrong for good",
 )
 _FALLBACK_REASONS = {
     EventCode.CONTROLLER_LATE: FallbackReason.CONTROLLER_FAILED,
@@ -459,7 +458,7 @@ def _watch_unengaged(state: ControlState, view: FilterView, measured: Measured, 
     jumped, inconsistent = measured.restarted and context.is_climbing_or_landing, not verdict.is_none
     unsafe = ""
     if jumped:
-        unsafe = "positions have jumped further than the vehicle can have come"
+        unsafe = "positions jumped further than the vehicle can move"
     elif inconsistent:
         unsafe = verdict.text
     elif is_armed and vehicle is not None and not vehicle.landed:
@@ -497,7 +496,7 @@ def _describe_unsafe(view: FilterView, context: TickContext) -> str:
     """Return why a vehicle in the air that others fly must not climb on by what is known of its position."""
     controller = context.controller
     if view.age_steps is not None and view.age_steps >= controller.horizon:
-        return f"no position has come for {controller.horizon * controller.plant.dt_s:.1f} s"
+        return f"no position arrived for {controller.horizon * controller.plant.dt_s:.1f} s"
     if controller.envelope is None:
         return ""
     observation = observe_motion(view.estimate, context, ZERO)

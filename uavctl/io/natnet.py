@@ -168,7 +168,7 @@ class NatNet:
             self._refuse(f"NatNet {text}, and this reads 3.0 to {NEWEST_MAJOR}.x; use Motive 2.0 to 3.x")
             return
         if not ticks_per_s:
-            self._refuse(f"NatNet {text} without the rate of its clock, so nobody could tell how old its frames are")
+            self._refuse(f"NatNet {text} without the rate of its clock, so the age of its frames is unknown")
             return
         self._info, self._version, self._ticks_per_s = payload, version, ticks_per_s
         self._is_complete = False

@@ -46,8 +46,7 @@ def load_timestamp(path: Path) -> int:
         return 0
     except OSError as error:
         raise KeyFileError(
-            f"stamp {path}: {error.strerror}; see to the folder: it and its files have to be this user's (did root "
-            "make them?)"
+            f"stamp {path}: {error.strerror}; check the folder: this user must own it and its files"
         ) from error
     except ValueError as error:
         raise KeyFileError(
@@ -129,8 +128,8 @@ class TimestampFile:
             write(path, self._written_timestamp)
         except OSError as error:
             raise KeyFileError(
-                f"stamp {path}: {error.strerror}, so that a restart would take old frames again; see to the folder: it "
-                "and its files have to be this user's (did root make them?)"
+                f"stamp {path}: {error.strerror}, so a restart would accept old frames; check the folder: "
+                "this user must own it and its files"
             ) from error
         self.failure: str | None = None
         self._done = threading.Event()

@@ -86,7 +86,7 @@ class UdpInConnection(_UdpConnection):
         ] = []  # read from the common socket when an own one was made
         _set_buffer_size(self._socket, COMMON_BUFFER_BYTES)
         self._attempt(
-            self._socket.bind, address, "is another program on this port? end it, or take another port or address"
+            self._socket.bind, address, "if another program uses this port, end it; else choose another port or address"
         )
 
     @property

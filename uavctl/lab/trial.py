@@ -184,10 +184,10 @@ SCENARIO_FIGURES: dict[Scenario, tuple[TableFigure, ...]] = {
     "blackout": (TableFigure("blackout_beyond_m", "beyond wall m", 1.0, 2), HOLD_FIGURE, NEAR_FIGURE, *COUNT_FIGURES),
 }
 FIGURE_NOTE = (
-    "Median, and the worst in brackets. Hold: distance of the true position from the target from the time on when it "
-    "is to be held. To 0.3 m, to 0.1 m: from when on it stayed so near, counted from the first order. Tracking: "
-    "distance from where the motion was to be at the time, mean and largest. Beyond wall: furthest beyond a limit of "
-    "the position; negative is the room that was left; with a blackout, from its begin on. Limited: share of setpoints "
+    "Median, and the worst in brackets. Hold: distance of the true position from the target, while the target is held. "
+    "To 0.3 m, to 0.1 m: time from the first order until the vehicle stayed so near. Tracking: distance from the "
+    "reference of the motion, mean and largest. Beyond wall: furthest point beyond a limit of the position, negative "
+    "inside; with a blackout, from its beginning on. Limited: share of setpoints "
     "that the setpoint limiter changed. Relaxed: share of plans with a relaxed constraint. Fallback: share of "
     "ticks in which no plan was flown."
 )

@@ -76,9 +76,10 @@ TIMESYNC_FLOOD = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system before it was read; perhaps the newest state of the vehicle
 # Code of a lost connection: what happened, and what follows.
 DISCONNECT_TEXTS = {
-    EventCode.HUNG_UP: ("the other side closed the connection", "it is called again each second"),
-    EventCode.CONNECTION_SILENT: ("nothing came over the connection any more", "it is made again"),
+    EventCode.HUNG_UP: ("the other side closed the connection", "the daemon connects again each second"),
+    EventCode.CONNECTION_SILENT: ("the connection fell silent", "the daemon connects again"),
 }
+_STALE_NOUNS = {EventCode.INERTIAL_STALE: "IMU message", EventCode.VELOCITY_STALE: "velocity message"}
 # Counted but not reported: every flight has them, or another event reports them.
 _NOT_REPORTED = frozenset({SkipReason.UNKNOWN, AUTOPILOT_ESTIMATE, *DISCONNECT_TEXTS})
 
@@ -229,7 +230,7 @@ class MavlinkConnection:
             code, _, cause = reason.partition(": ")
             self._count_bad(code, count)
             if code == EventCode.PROCESS_ENDED:
-                text = f"the process that listens to the cameras has ended: {cause}"
+                text = f"the camera process has ended: {cause}"
                 events.append(self._make_event(at_ns, Severity.ERROR, EventCode.PROCESS_ENDED, text))
         return (*events, *self._make_events(at_ns))
 
@@ -390,7 +391,7 @@ class MavlinkConnection:
 
     def _target_address(self) -> tuple[int, int]:
         if self._vehicle.address is None:
-            raise UnsendableError(f"link {self._name}: no vehicle has been heard, so there is nobody to send to")
+            raise UnsendableError(f"link {self._name}: no vehicle has been heard, so nothing can be sent")
         return self._vehicle.address
 
     def _handle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
@@ -438,7 +439,7 @@ class MavlinkConnection:
                 ParameterDownload(),
                 ArrivalClock(),
             )
-            text = "the vehicle has started anew"
+            text = "the vehicle has restarted"
             return (*items, self._make_event(at_ns, Severity.ERROR, EventCode.VEHICLE_REBOOT, text))
         if self._vehicle.not_ready_count != not_ready_count:
             self._streams.restart()  # streams that continue are received again before the next request
@@ -504,14 +505,14 @@ class MavlinkConnection:
         events = []
         if self._positions.resyncs > self._reported_resyncs:
             self._reported_resyncs = self._positions.resyncs
-            text = "a source's clock has jumped; synchronised anew"
+            text = "a source's clock jumped, and is synchronised again"
             events.append(self._make_event(at_ns, Severity.WARNING, EventCode.CLOCK_RESYNC, text))
         for (system, component), unit in self._positions.units.items():
             if (system, component, unit) not in self._reported_units:
                 self._reported_units.add((system, component, unit))
-                fault = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
+                fault = "do not advance" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
                 text = f"stamps of the positions of {system}/{component} {fault}: "
-                text += "they count by their arrival, and their ages are not known"
+                text += "ages count from arrival"
                 events.append(self._make_event(at_ns, Severity.WARNING, EventCode.STAMP_UNIT, text))
         since_ns = self._no_heartbeat_since_ns
         if (
@@ -523,13 +524,13 @@ class MavlinkConnection:
             self._is_no_heartbeat_reported = True
             sender = self._no_heartbeat_address and self._no_heartbeat_address[0]
             text = f"system {sender} sends its position or attitude, "
-            text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
+            text += "but no heartbeat of an autopilot. Its mode is unknown, so the controller does not fly it"
             events.append(self._make_event(at_ns, Severity.WARNING, EventCode.NO_HEARTBEAT, text))
         used_count, total = self._vehicle.inertial_used, self._vehicle.inertial_total
         if not self._is_low_share_reported and total >= MIN_INERTIAL and used_count < MIN_INERTIAL_SHARE * total:
             self._is_low_share_reported = True
-            text = f"{1 - used_count / total:.0%} of the inertial data are not used: late, frozen, "
-            text += "or without an attitude of now"
+            text = f"{1 - used_count / total:.0%} of the IMU data are ignored: late, frozen, "
+            text += "or without a current attitude"
             events.append(self._make_event(at_ns, Severity.WARNING, EventCode.INERTIAL_STALE, text, total - used_count))
         if self._slow_count and (self._slow_reported_ns is None or at_ns - self._slow_reported_ns >= SLOW_EVENT_NS):
             self._slow_reported_ns = at_ns
@@ -544,8 +545,8 @@ class MavlinkConnection:
     def _make_slow_answer_event(self, at_ns: int) -> Event:
         """Return the event about answers to TIMESYNC that were too slow; harmless while other answers are used."""
         known = self._positions.are_clocks_known(at_ns)
-        text = "answers to TIMESYNC came too slow to be used; the clock " + (
-            "stays known by the others" if known else "is not known by them any more"
+        text = "answers to TIMESYNC came too late, and are ignored; the clock " + (
+            "is still known by others" if known else "is unknown"
         )
         severity = Severity.INFO if known else Severity.WARNING
         return self._make_event(at_ns, severity, EventCode.SLOW_ANSWER, text, self._slow_count)
@@ -554,14 +555,23 @@ class MavlinkConnection:
         events = []
         vehicles = self._unreported.pop(EventCode.SECOND_VEHICLE, 0)
         if vehicles and self._vehicle.address is not None:
-            text = f"another vehicle than system {self._vehicle.address[0]} is heard, and ignored"
+            text = f"another vehicle than system {self._vehicle.address[0]} is on this link; its messages are ignored"
             events.append(self._make_event(at_ns, Severity.ERROR, EventCode.SECOND_VEHICLE, text, vehicles))
         if self._unreported:
-            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self._unreported.items()))
-            text = f"dropped {reasons}"
-            count = self._unreported.total()
+            text, count = _describe_drops(self._unreported), self._unreported.total()
             events.append(self._make_event(at_ns, Severity.WARNING, EventCode.DROPPED, text, count))
         return events
+
+
+def _describe_drops(counts: Mapping[str, int]) -> str:
+    """Describe ignored data: late messages by their content, all others by the codes of the manual."""
+    texts = [
+        f"{counts[code]} {noun}{'' if counts[code] == 1 else 's'}: too old"
+        for code, noun in _STALE_NOUNS.items()
+        if counts.get(code)
+    ]
+    others = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()) if reason not in _STALE_NOUNS)
+    return "ignored " + "; ".join([*texts, f"data: {others}"] if others else texts)
 
 
 def make_links(

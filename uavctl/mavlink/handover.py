@@ -64,9 +64,9 @@ _CLIMB_STATES = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, Handove
 # States in which a failsafe, or nobody who is known, has the vehicle for a limited time.
 _INTERRUPTED_STATES = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
 _ORDER_TEXTS = {
-    Order.TAKE_OFF: "will take off",
-    Order.ENGAGE: "asks for the mode that takes setpoints",
-    Order.STAND_BY: "leaves a vehicle alone that is found armed",
+    Order.TAKE_OFF: "take-off begins",
+    Order.ENGAGE: "OFFBOARD or GUIDED is requested",
+    Order.STAND_BY: "nothing is sent to an armed vehicle",
 }
 HAND_OVER_ORDERS = frozenset(_ORDER_TEXTS)  # all other orders are for the controller
 
@@ -274,11 +274,11 @@ class HandoverStateMachine:
         if command.order is Order.ENGAGE:
             return explain_engage_refusal(self.state, inputs)
         if command.order is Order.STAND_BY:
-            return "" if self.state is HandoverState.WAITING else f"the vehicle has been heard; now: {self.state}"
+            return "" if self.state is HandoverState.WAITING else f"the vehicle is already heard (state: {self.state})"
         if not (command.height_m or 0.0) > 0.0:
-            return f"a climb to {command.height_m} m is none"
+            return f"{command.height_m} m is not a height to climb to"
         is_on_ground = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.is_ordered_flight
-        return "" if is_on_ground else f"take-off is ordered once, on the ground; now: {self.state}"
+        return "" if is_on_ground else f"take-off is possible once, from the ground (state: {self.state})"
 
     def _may_be_pilot_mode_change(self, inputs: HandoverInput) -> bool:
         """Return whether the pilot may have changed the mode since the last heartbeat.
@@ -388,13 +388,13 @@ class HandoverStateMachine:
         is_heartbeat_lost = self.state is HandoverState.ENGAGED and result.event is HandoverEvent.SILENCE
         if is_heartbeat_lost != self._is_heartbeat_lost:
             self._is_heartbeat_lost = is_heartbeat_lost
-            suffix = ", though its other messages come" if inputs.has_motion else ", and nothing else comes"
-            text = f"heartbeat lost{suffix}: braking and holding" if is_heartbeat_lost else "heartbeat is back"
+            others = "other messages arrive" if inputs.has_motion else "no other message arrives"
+            text = f"no heartbeat, {others}: braking and holding" if is_heartbeat_lost else "the heartbeat is back"
             events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code=EventCode.HEARTBEAT, text=text))
         is_landing = self.state is HandoverState.LANDING
         overdue = self._progress.request.find_failure(inputs.at_ns) if is_landing else None
         if overdue is not None and not self._is_landing_overdue:
-            text = f"{overdue.text}; it is asked on, as it is heard in the air"
+            text = f"{overdue.text}; landing is requested again while the vehicle is in the air"
             events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code=EventCode.REQUEST_FAILED, text=text))
         self._is_landing_overdue = overdue is not None
         if has_changed:

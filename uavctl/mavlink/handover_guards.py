@@ -45,14 +45,14 @@ MIN_CLOCK_RATE, BOOT_TIME_MARGIN_S = 0.8, 1.0
 _SECOND_VEHICLE = make_failure("nothing is armed; give each its own link", "another vehicle is heard on this link: ")
 _TAKE_OFF = f"{RequestKind.TAKE_OFF}: "
 _ALREADY_ARMED = (
-    "the vehicle is armed already; it begins on the ground, disarmed. Land and disarm it, or start without --arm "
-    "--takeoff to fly it from where it is"
+    "the vehicle is already armed. A take-off begins disarmed, on the ground. Land and disarm, or start without --arm "
+    "--takeoff to fly from here"
 )
-_ENGAGE_HINT = ", and ask for that with `uavctl ctl engage`"
-_SLOW_OR_PILOT = "it is slow, or the pilot has taken it back"
-_DISARMED = make_failure("the vehicle has disarmed itself")
+_ENGAGE_HINT = ", then type `uavctl ctl engage`"
+_SLOW_OR_PILOT = "the vehicle is slow, or the pilot changed the mode"
+_DISARMED = make_failure("the vehicle disarmed itself")
 _LEFT_IN_FLIGHT = make_failure(
-    "a daemon before this one has left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
+    "an earlier daemon left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
 )
 
 
@@ -145,9 +145,9 @@ def explain_engage_refusal(state: HandoverState, inputs: HandoverInput) -> str:
     """Return why the external mode must not be requested again; empty if it may."""
     vehicle = inputs.vehicle
     if state not in (HandoverState.READY, HandoverState.TAKEN_OVER, HandoverState.UNCLEAR, HandoverState.FAILSAFE):
-        return f"there is nothing to engage; now: {state}"
+        return f"nothing to engage (state: {state})"
     if vehicle is None or is_silent(inputs.at_ns, vehicle) or vehicle.autopilot not in PROFILES:
-        return "no vehicle is heard that could be flown"
+        return "no known vehicle is heard"
     if not vehicle.armed or vehicle.landed:
         return "the vehicle is not in the air"
     return inputs.arming_refusal
@@ -161,11 +161,11 @@ def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) ->
         return "no vehicle is heard"
     mode = vehicle.mode
     if state is HandoverState.READY:
-        return f"it is not we who fly: the vehicle is in mode {mode}, and the pilot has not switched"
+        return f"the controller does not fly: the vehicle is in mode {mode}, and the pilot has not switched"
     if state in TAKING_OFF:
-        return f"the vehicle is on its way up ({state}); order it once it is flown"
+        return f"the vehicle is climbing ({state}); repeat the order after the climb"
     if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR, HandoverState.TAKEN_OVER, HandoverState.RETURNING):
-        return f"the vehicle has been taken over ({state}, in mode {mode}); `uavctl ctl engage` asks for it back"
+        return f"the vehicle was taken over ({state}, in mode {mode}); `uavctl ctl engage` takes it back"
     return f"the vehicle has been handed over ({state})"
 
 
@@ -173,7 +173,7 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
     """Return the event of a tick; of several, the first in the order of `HandoverEvent`."""
     vehicle, state = inputs.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
-        return GuardResult(HandoverEvent.REBOOT, make_failure("the vehicle has started anew"))
+        return GuardResult(HandoverEvent.REBOOT, make_failure("the vehicle has restarted"))
     result = GuardResult(HandoverEvent.SILENCE)
     if vehicle is not None and not is_silent(inputs.at_ns, vehicle):
         result = _GUARDS.get(state, _guard_standby)(progress, inputs, vehicle)
@@ -196,7 +196,7 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
         # The controller has ended without a landing, and no pilot has the vehicle that we took off.
         return GuardResult(HandoverEvent.LAND)
     if state in _CLIMB_STATES and inputs.climb_hazard:
-        return GuardResult(HandoverEvent.UNSAFE, make_failure(inputs.climb_hazard, "the climb is broken off: "))
+        return GuardResult(HandoverEvent.UNSAFE, make_failure(inputs.climb_hazard, "the climb was aborted: "))
     if result.event in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
         return result
     if result.event is HandoverEvent.DISARMED and state is HandoverState.LANDING:
@@ -253,10 +253,10 @@ def _find_wait_timeout(progress: HandoverProgress, inputs: HandoverInput) -> Fai
         return None
     if is_unclear:
         mode = "" if vehicle is None else vehicle.mode
-        text = f"nobody has shown in {limit_s:g} s that he has the vehicle, which flies by itself ({mode})"
+        text = f"no pilot took control in {limit_s:g} s, and the vehicle flies by itself ({mode})"
         return make_failure(text)
     is_failsafe_active = vehicle is None or is_in_failsafe(vehicle)
-    outcome = "has not ended" if is_failsafe_active else "has ended, and nobody has taken the flight up again,"
+    outcome = "has not ended" if is_failsafe_active else "has ended, and no pilot took control"
     outcome += f" in {limit_s:g} s{progress.failsafe_texts}"
     return Failure(f"{_describe_failsafe(progress)} {outcome}", f"{progress.previous_mode} {outcome}")
 
@@ -272,7 +272,7 @@ def _find_take_off_failure(progress: HandoverProgress, inputs: HandoverInput) ->
     if progress.take_off_ordered_ns is None:
         return None
     if vehicle is not None and vehicle.autopilot not in PROFILES:
-        text = f"how autopilot {vehicle.autopilot!r} takes off is not known; PX4 and ArduCopter are"
+        text = f"autopilot {vehicle.autopilot!r} is not supported; use PX4 or ArduCopter"
         return make_failure(text, _TAKE_OFF)
     if vehicle is not None and not vehicle.alone:
         return _SECOND_VEHICLE
@@ -410,7 +410,7 @@ def _guard_external(progress: HandoverProgress, _inputs: HandoverInput, vehicle:
 def _guard_failsafe(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event in a failsafe of an ordered flight; the pilot can take over at any time."""
     if not vehicle.armed:
-        text = f"{_describe_failsafe(progress)} has landed it{progress.failsafe_texts}"
+        text = f"{_describe_failsafe(progress)} has landed the vehicle{progress.failsafe_texts}"
         return GuardResult(HandoverEvent.DISARMED, make_failure(text))
     if is_ordered(inputs, Order.ENGAGE) and not explain_engage_refusal(progress.state, inputs):
         return GuardResult(HandoverEvent.ENGAGE)

@@ -39,7 +39,7 @@ class ModeReason(StrEnum):
     GROUND_STATION = "a ground station"
     FAILSAFE = "the vehicle's own failsafe"
     FENCE = "the vehicle's own fence"
-    UNKNOWN = "not known by whom"
+    UNKNOWN = "unknown reason"
 
 
 VEHICLE_REASONS = frozenset({ModeReason.FAILSAFE, ModeReason.FENCE})  # the vehicle itself

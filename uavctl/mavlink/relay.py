@@ -30,17 +30,17 @@ SILENT_NS = 500_000_000  # without positions for longer, an estimator drifts by 
 START_NS = 3_000_000_000  # start time of cameras and vehicle
 NO_POSITION, HELD_BACK = "nothing comes", "held back"
 REASONS = {
-    NO_POSITION: "no position comes",
-    HELD_BACK: "positions were found to be wrong, and are held back",
-    "no attitude": "positions come without an attitude",
-    "refused": "positions are not believed",
-    "old": f"positions come later than {MAX_AGE_NS / 1e6:.0f} ms after their capture",
-    "frozen": "positions do not change any more, not by the last bit",
-    "out of order": "positions come that are older than those before",
-    "rate": "stamps of positions do not go on",
-    "no clock": "stamps of positions are from before the vehicle's start",
-    TILTED: "the tilt of poses is not the vehicle's",
-    TURNED: "the turn of poses is not the vehicle's",
+    NO_POSITION: "no position arrives",
+    HELD_BACK: "positions are wrong and are held back",
+    "no attitude": "positions arrive without an attitude",
+    "refused": "the filter refused positions",
+    "old": f"positions arrive more than {MAX_AGE_NS / 1e6:.0f} ms after their capture",
+    "frozen": "positions repeat to the last bit",
+    "out of order": "positions arrive out of order",
+    "rate": "stamps of positions do not advance",
+    "no clock": "stamps of positions are older than the vehicle's start",
+    TILTED: "the tilt of poses differs from the vehicle's",
+    TURNED: "the turn of poses differs from the vehicle's",
 }
 WRONG_ATTITUDES = 5  # poses with a wrong attitude within `ATTITUDE_NS`: a fault, and no outlier
 ATTITUDE_NS = 1_000_000_000
@@ -154,7 +154,7 @@ class Relay:
         self.silent_for = "" if not is_silent else HELD_BACK if held_back else self._find_silence_reason()
         if not is_silent and self._reported:
             self._reported = ""
-            text = "the vehicle gets positions again"
+            text = "the vehicle receives positions again"
             return Event(at_ns=at_ns, severity=Severity.INFO, code=EventCode.RELAY_RESUMED, text=text)
         if (
             not is_silent
@@ -165,7 +165,7 @@ class Relay:
         self._reported = "armed" if armed else "ground"
         self._is_reported_on_ground = self._is_reported_on_ground or not armed
         since_ns = self._start_ns if self.last_ns is None else since_ns
-        text = f"the vehicle gets no position since {(at_ns - since_ns) * 1e-9:.1f} s: {REASONS[self.silent_for]}"
+        text = f"the vehicle has received no position for {(at_ns - since_ns) * 1e-9:.1f} s: {REASONS[self.silent_for]}"
         return Event(at_ns=at_ns, severity=Severity.WARNING, code=EventCode.RELAY_SILENT, text=text)
 
     def make_attitude_event(self, at_ns: int) -> Event | None:
@@ -175,12 +175,12 @@ class Relay:
         is_wrong = len(wrong) == WRONG_ATTITUDES and wrong[-1][0] - wrong[0][0] <= ATTITUDE_NS and not is_over
         if is_wrong and not self.attitude_fault:
             self.attitude_fault = fault = wrong[-1][1]
-            text = f"{REASONS[fault]}; they are not passed on to it"
+            text = f"{REASONS[fault]}; these poses are not passed on"
             severity, code = Severity.WARNING, EventCode.RELAY_ATTITUDE
             return Event(at_ns=at_ns, severity=severity, code=code, text=text, subject=fault)
         if is_over and self.attitude_fault and self.last_ns is not None and self.last_ns > wrong[-1][0]:
             self.attitude_fault = ""
-            text = "the attitude of poses is right again; they are passed on"
+            text = "the attitude of poses is right again; poses are passed on"
             return Event(at_ns=at_ns, severity=Severity.INFO, code=EventCode.RELAY_ATTITUDE_RIGHT, text=text)
         return None
 

@@ -138,13 +138,13 @@ class PendingRequest:
 
     def _describe_answer(self) -> str:
         if self._blocked_reason and self._result is None:
-            return f"not asked for, because {self._blocked_reason}"
+            return f"not requested, because {self._blocked_reason}"
         if self._result is None:
             return "the vehicle did not answer"
         name = mavlink.enums["MAV_RESULT"].get(self._result)
         result = str(self._result) if name is None else str(name.name).removeprefix("MAV_RESULT_")
         if self._result == mavlink.MAV_RESULT_ACCEPTED:
-            return f"the vehicle answered {result}, but does not do it"
+            return f"the vehicle answered {result}, but did not do it"
         return f"the vehicle answered {result}"
 
     @property
@@ -157,4 +157,4 @@ class PendingRequest:
         if self.kind is None:
             return seconds
         times = "once" if self._tries == 1 else f"{self._tries} times"
-        return f"asked {times} in {seconds}" if self._tries else f"it could not be asked in {seconds}"
+        return f"requested {times} in {seconds}" if self._tries else f"not sent in {seconds}"

@@ -119,7 +119,7 @@ def create_controller(
         raise DesignError(
             key,
             f'controller "{name}" cannot be made for this problem ({in_words(error)})',
-            "mend its __init__, or raise uavctl.errors.DesignError where it is not for such a plant",
+            "correct its __init__, or raise uavctl.errors.DesignError where it is not for such a plant",
         ) from error
 
 
@@ -138,7 +138,7 @@ def build_outside_solver(config: Config, problem: ControlProblem) -> OutsideSolv
     if config.mission.trajectory.times_s:
         raise DesignError(
             CONTROLLER_KEY,
-            f'controller "{name}" is told no trajectory',
+            f'controller "{name}" cannot follow a trajectory',
             "give it plan(request), or fly waypoints instead",
         )
     create_controller(controller_class, name, CONTROLLER_KEY, problem)  # a failure is raised here, not in flight

@@ -211,7 +211,7 @@ def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
     write(tmp_path, [cell(0, "a")], runs(0, [1.0]))
     (path,) = (tmp_path / "runs.parquet").iterdir()
     path.write_bytes(b"torn")
-    with pytest.raises(UavctlError, match=rf"{path.name} is damaged.*remove it and go on with --resume"):
+    with pytest.raises(UavctlError, match=rf"{path.name} is damaged.*remove it and continue with --resume"):
         summarise(tmp_path)
 
 

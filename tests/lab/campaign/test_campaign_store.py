@@ -66,7 +66,7 @@ def test_only_the_same_campaign_continues_and_only_with_resume(tmp_path: Path) -
         assert (tmp_path / "one" / "campaign.toml").read_text() == "text"
         with pytest.raises(UsageError, match="another process"), Store(store.folder).open(DOCUMENT, "text", True):
             pass
-    with pytest.raises(UsageError, match="go on with it by --resume"), store.open(DOCUMENT, "text", resume=False):
+    with pytest.raises(UsageError, match="continue it with --resume"), store.open(DOCUMENT, "text", resume=False):
         pass
     with store.open(DOCUMENT, "text", resume=True):
         pass

@@ -240,7 +240,7 @@ def test_a_recorded_flight_that_ends_early_ends_the_comparison() -> None:
     shortened = make_recorded_flight(cut, config, "x")
     response = make_response(shortened, config.plant)
     course = refly(shortened, config, build_controller(config), response, memory, lambda: 0)
-    assert course.end_ns == end_ns and "no setpoint" in course.ended
+    assert course.end_ns == end_ns and "no more setpoints" in course.ended
     assert memory.entries[-1][1] < end_ns + 1_000_000_000
     assert max(at_ns for _, at_ns, _ in cut_entries(memory.entries, end_ns)) == end_ns
 

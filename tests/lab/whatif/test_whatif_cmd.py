@@ -159,7 +159,7 @@ def test_a_model_with_gusts_moves_the_vehicle_as_one_without(
         (("--config", "room-hahn-stursberg"), "room-hahn-stursberg: plant has 9 states, 3 inputs"),
         (("--config", "missing.toml"), "no such file or preset"),
         (("--model", "room-hahn-stursberg"), "--model room-hahn-stursberg: plant has 9 states"),
-        (("--seed", "4"), "--seed is of a simulated link"),
+        (("--seed", "4"), "--seed belongs to a simulated link"),
         (("--link", "none"), "--link none: give `recorded` or `configured`"),
         (("--link", "recorded", "--link", "loss=0.1"), "give `recorded` or `configured` alone"),
         (("--link", "los=0.1"), 'nearest valid name "loss"'),

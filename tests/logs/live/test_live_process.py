@@ -376,7 +376,7 @@ def test_97_a_live_view_ends_with_a_flight_that_is_killed(tmp_path: Path) -> Non
 def test_a_port_that_cannot_be_had_is_told() -> None:
     with open_port(0) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(UsageError, match=f"port {port} cannot be had.*--live-port"):
+        with pytest.raises(UsageError, match=f"port {port} cannot be used.*--live-port"):
             LiveProcess(port, print)
     for number in (70_000, -1):
         with pytest.raises(UsageError, match=f"--live-port {number}: ports are 1 to 65535"):

@@ -176,6 +176,7 @@ def test_a_flight_in_several_files_is_replayed_from_the_first(
     flight = rotated / "flight.mcap"
     assert run(["log", "replay", str(flight), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
+    assert found["texts_compared"]
     assert found["identical"] and found["decisions"] == sum(1 for _ in read_kind(flight, Decision)) == 250
     assert (found["first_difference"], found["context"], found["course"], found["changed"]) == (None, None, [], [])
 
@@ -212,7 +213,7 @@ def test_a_recording_without_its_last_file_is_alike_up_to_there_and_says_so(
     assert run(["log", "replay", str(flight), "--json"]) == 0
     told = capsys.readouterr()
     assert 100 < json.loads(told.out)["decisions"] < 250
-    assert f"goes on after {last}" in told.err and "missing" in told.err
+    assert f"continues after {last}" in told.err and "missing" in told.err
 
 
 def test_a_hole_in_a_recovered_recording_is_told(

@@ -60,7 +60,13 @@ def test_a_note_has_its_kind(text: str, kind: NoteKind, lacks: tuple[bool, bool]
 
 
 @pytest.mark.parametrize(
-    ("phrase", "cause"), [("landed by the fallback", Cause.FALLBACK_LANDED), ("the pilot has taken over", Cause.PILOT)]
+    ("phrase", "cause"),
+    [
+        ("landed by the fallback", Cause.FALLBACK_LANDED),
+        ("the pilot has taken over", Cause.PILOT),
+        ("the vehicle fell silent", Cause.VEHICLE_SILENT),  # worded otherwise today
+        ("nothing was flown", Cause.NOT_FLOWN),
+    ],
 )
 def test_an_ending_has_its_code(phrase: str, cause: Cause) -> None:
     fields = {"cause": phrase, "as_ordered": True, "sentence": "", "exit_code": 0}

@@ -168,7 +168,7 @@ def test_a_leap_of_the_clock_is_told_and_time_goes_on(tmp_path: Path, leap_s: in
     leaped = [(*row[:2], row[2] + (leap_s * S if number >= 400 else 0), row[3]) for number, row in enumerate(rows)]
     found = read_mcap(write(tmp_path / "a.mcap", leaped))
     assert [one.data for one in found.packets] == [row[3] for row in rows]
-    assert found.notes == (f"/mavlink: its clock leaps (1 time, by up to {abs(leap_s)} s); taken as if it had gone on",)
+    assert found.notes == (f"/mavlink: its clock jumps (1 time, by up to {abs(leap_s)} s); the jumps are removed",)
     gap_ns = rows[400][2] - rows[399][2]
     assert [one.at_ns for one in found.packets] == [
         row[2] - (gap_ns if at >= 400 else 0) for at, row in enumerate(rows)
@@ -184,7 +184,7 @@ def test_stamps_of_zero(tmp_path: Path) -> None:
     times[100], times[200] = times[99], times[199]
     assert [one.at_ns for one in found.packets] == times
     assert [one.data for one in found.packets] == [row[3] for row in rows]
-    assert found.notes == ("/mavlink: 2 time stamps of zero; taken for the time before",)
+    assert found.notes == ("/mavlink: 2 time stamps of zero; replaced by the time before",)
     none = [(*row[:2], 0, row[3]) for row in rows]
     with pytest.raises(RecordingError, match="/mavlink: all 300 time stamps are zero"):
         read_mcap(write(tmp_path / "b.mcap", none, publish_ns=0))
@@ -226,7 +226,7 @@ def test_a_tlog_whose_clock_leaps_loses_nothing(tmp_path: Path, name: str, leap_
     assert (found.torn_bytes, found.skipped_bytes) == (0, 0)
     gap_us = rows[300][0] - rows[299][0]
     by_s = abs(leap_us + gap_us) * 1e-6
-    assert found.notes[0] == f"a.tlog: its clock leaps (1 time, by up to {by_s:.0f} s); taken as if it had gone on"
+    assert found.notes[0] == f"a.tlog: its clock jumps (1 time, by up to {by_s:.0f} s); the jumps are removed"
     assert [one.at_ns // 1000 for one in found] == [at - (gap_us if n >= 300 else 0) for n, (at, _) in enumerate(rows)]
 
 

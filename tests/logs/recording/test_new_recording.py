@@ -54,7 +54,7 @@ def test_a_taken_port_of_the_live_view_leaves_no_folder(
     options = ("--udp",) if command == "loopback" else ("--vehicle", f"udpin://127.0.0.1:{free_port()}")
     out = tmp_path / "flights" / "one"
     assert run([command, *options, *EXACT, "--live", "--live-port", str(taken_port), "--out", str(out)]) == 2
-    assert f"port {taken_port} cannot be had" in capsys.readouterr().err
+    assert f"port {taken_port} cannot be used" in capsys.readouterr().err
     assert not (tmp_path / "flights").exists()
 
 

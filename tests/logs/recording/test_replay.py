@@ -10,7 +10,7 @@ import pytest
 from loopback_rig import MemorySink, lockstep, make_loop, shared_loop
 from places import DATA
 
-from logs.recording.replay import replay
+from logs.recording.replay import TEXTS, replay
 from logs.recording.tlog import read_tlog, replay_tlog
 from logs.recording.topics import ENDED, encode, parse_raw_topic
 from uavctl.account import make_ending
@@ -47,6 +47,26 @@ def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: MemorySink) -> 
     assert first.recorded == repr(nudged[0]) and first.replayed == repr(record.input[0])
     close = replay(changed, lambda sink: shared_loop(load_config("paper"), sink), tolerance=1e-9)
     assert close.identical
+
+
+def test_texts_of_another_version_are_not_compared_but_all_that_stands_beside_them(flown: MemorySink) -> None:
+    replayed = partial(replay, make_loop=lambda sink: shared_loop(load_config("paper"), sink))
+    worded = [
+        (topic, at_ns, msgspec.structs.replace(record, text="in other words"))
+        if isinstance(record, Event)
+        else (topic, at_ns, msgspec.structs.replace(record, reason="in other words"))
+        if isinstance(record, Decision)
+        else (topic, at_ns, record)
+        for topic, at_ns, record in flown.entries
+    ]
+    assert not replayed(worded).identical
+    assert replayed(worded, ignored=TEXTS).identical
+    at = next(i for i, (_, _, record) in enumerate(worded) if isinstance(record, Event))
+    topic, at_ns, event = worded[at]
+    assert isinstance(event, Event)
+    for change in ({"code": "another"}, {"count": event.count + 1}, {"subject": "another"}, {"at_ns": at_ns + 1}):
+        worded[at] = (topic, at_ns, msgspec.structs.replace(event, **change))
+        assert not replayed(worded, ignored=TEXTS).identical
 
 
 @pytest.mark.slow

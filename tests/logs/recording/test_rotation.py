@@ -72,7 +72,7 @@ def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -
     assert texts(path) == [
         "begin",
         *(
-            "goes on in the next file" if end else f"goes on after {files[i].name}"
+            "continues in the next file" if end else f"continues after {files[i].name}"
             for i in range(len(files) - 1)
             for end in (True, False)
         ),

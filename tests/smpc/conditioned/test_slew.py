@@ -133,5 +133,6 @@ def test_relaxed_constraints_are_described() -> None:
     names = name_constraints(np.eye(2), 2, ("north",), (0,), (1,))
     slew = GaveWay(constraint="slew", stage=0, index=0, amount=0.4)
     state = GaveWay(constraint="state", stage=1, index=0, amount=0.01)
-    assert describe_relaxed(names, slew) == "the limit of how fast the north setpoint changes gave way by 0.4 m/s²"
+    text = describe_relaxed(names, slew)
+    assert "north" in text and "0.4 m/s²" in text
     assert find_worst(names, (slew, state)) is state

@@ -83,7 +83,7 @@ def update(state: AccelerationState, observation: PositionObservation) -> tuple[
     if over_ns is not None and (ratio >= IMMEDIATE_RATIO or observation.at_ns - over_ns >= PERSISTS_NS):
         return state, end_plans(EventCode.RESPONSE, _describe_response(unexplained, observation))
     if sum(clipped) >= CLIPPED_LIMIT:
-        return state, end_plans(EventCode.SCATTER, "positions scatter by more than the vehicle can move")
+        return state, end_plans(EventCode.SCATTER, "positions scatter more than the vehicle can move")
     return state, NO_VERDICT
 
 
@@ -109,11 +109,11 @@ def _explain_push(
 def _describe_response(unexplained: Array, observation: PositionObservation) -> str:
     observer, tick = observation.observer, observation.tick
     text = (
-        f"positions show an acceleration of {describe_vector(unexplained)} m/s² that no setpoint asked for "
-        f"({describe_vector(observer.accel_mps2)} m/s² was)"
+        f"positions show an acceleration of {describe_vector(unexplained)} m/s² beside that of the setpoints "
+        f"({describe_vector(observer.accel_mps2)} m/s²)"
     )
     leans = _leans_as_sent(observer, unexplained, tick.motion, tick.at_ns)
-    return text if leans is None else f"{text}; the vehicle leans {'as' if leans else 'otherwise than'} it was told"
+    return text if leans is None else f"{text}; the vehicle {'tilts' if leans else 'does not tilt'} as commanded"
 
 
 def describe_push(motion: Motion, vehicle: VehicleMotion | None, at_ns: int) -> str:
@@ -136,12 +136,12 @@ def describe_acceleration(push_mps2: Sequence[float], leans: bool | None) -> str
         size, way = abs(down), "down" if down > 0.0 else "up"
     else:
         size, way = sideways, _COMPASS[round(math.atan2(east, north) / (0.25 * math.pi)) % len(_COMPASS)]
-    why = {
-        None: "Positions and the vehicle's inertial data agree",
-        True: "The autopilot tilts as it was told, and positions and inertial data agree",
-        False: "The autopilot tilts otherwise than it was told, and positions and inertial data agree",
+    tilt = {
+        None: "",
+        True: " although the autopilot tilted as commanded",
+        False: ", and the autopilot did not tilt as commanded",
     }[leans]
-    return f"Pushed {size:.1f} m/s² {way}. {why}: strong wind, or a hit."
+    return f"Pushed {size:.1f} m/s² {way}{tilt}: strong wind or a hit. Positions and IMU data agree."
 
 
 def _leans_as_sent(observer: Observer, unexplained: Array, vehicle: VehicleMotion | None, at_ns: int) -> bool | None:

@@ -120,7 +120,7 @@ def _describe_failure(
             asked_mps2 = max(asked_mps2, sent_mps2)
         if asked_mps2 >= ASKED_MPS2 and got_mps2 < PART * asked_mps2:
             return (
-                f"setpoints ask for {asked_mps2:.1f} m/s² before the {approach.limit} limit, and the vehicle brakes by "
-                f"{got_mps2:.1f} m/s²: it does not answer them, or a strong wind has set in"
+                f"near the {approach.limit} limit the vehicle brakes with {got_mps2:.1f} m/s² instead of "
+                f"{asked_mps2:.1f} m/s²: wrong response to setpoints, or strong wind"
             )
     return ""

@@ -67,5 +67,5 @@ def update(
     # v > 0.8 v_0 + 0.3 m/s
     if tick.at_ns - since_ns < EFFECT_NS or speed_mps <= MAX_SPEED_PART * began_mps + MAX_SPEED_MPS:
         return state, NO_VERDICT
-    text = f"braking does not brake: {began_mps:.1f} m/s then, {speed_mps:.1f} m/s now"
+    text = f"braking has no effect: {began_mps:.1f} m/s before, {speed_mps:.1f} m/s now"
     return state, end_plans(EventCode.BRAKING, text + describe_overrun(tick, observation.parameters))

@@ -64,10 +64,10 @@ def update(state: ExternalState, observation: AnswerObservation) -> tuple[Extern
     late = state.overdue_answers + 1 if took_ns > tick_ns else 0
     if state.fault or (late < MAX_OVERDUE_ANSWERS and took_ns <= MAX_ANSWER_NS):
         return ExternalState(late, state.fault), NO_VERDICT
-    times = f", too late {late} times in a row" if late > 1 else ""
+    times = f", {late} times in a row" if late > 1 else ""
     fault = (
-        f"the controller {observation.name} is too late: its plan took {took_ns * 1e-9:.3f} s, "
-        f"a tick has {tick_ns * 1e-9:g} s{times}"
+        f"controller {observation.name} is too slow: a plan took {took_ns * 1e-9:.3f} s, "
+        f"a tick lasts {tick_ns * 1e-9:g} s{times}"
     )
     return ExternalState(late, fault), end_plans(EventCode.CONTROLLER_LATE, fault)
 
@@ -103,8 +103,8 @@ def judge_wall(observation: WallObservation) -> Verdict:
         for axis, speed, over, margin in zip(AXES, outward, over_m, margin_m, strict=True):
             if speed > 0.0 and over > 0.0:
                 text = (
-                    f"the controller {observation.name} flies at the limit of {axis}: braking from {speed:.1f} m/s "
-                    f"would end {over + margin:.1f} m beyond it"
+                    f"controller {observation.name} flies too fast along {axis}: braking from {speed:.1f} m/s "
+                    f"would end {over + margin:.1f} m beyond the limit"
                 )
                 return end_plans(EventCode.CONTROLLER_WALL, text)
     return NO_VERDICT

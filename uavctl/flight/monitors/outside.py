@@ -76,7 +76,7 @@ def describe_sideways(observation: Observation) -> str:
     speed_mps = math.hypot(*(own or observation.velocity_mps)[:2])
     if speed_mps <= SIDEWAYS_MPS:
         return ""
-    return f"it flies sideways at {speed_mps:.1f} m/s in its climb: its heading may be wrong"
+    return f"the vehicle moves sideways at {speed_mps:.1f} m/s in its climb: its heading may be wrong"
 
 
 def is_outside(observation: Observation, parameters: EnvelopeParameters) -> bool:
@@ -106,7 +106,7 @@ def _describe_outside(observation: Observation, parameters: EnvelopeParameters, 
     )
     for (below, above), has, position, velocity, lower, upper, margin, brake in rows:
         if has and not math.isfinite(position + velocity):
-            return f"the estimate of the way to the {above} limit is no number"
+            return f"the estimated distance to the {above} limit is not a number"
         for limit, out_m, outward in ((below, lower - position, -velocity), (above, position - upper, velocity)):
             # s = v T + v² / 2 a
             stop_m = outward * REACTION_S + outward * outward / (2.0 * brake)
@@ -158,7 +158,7 @@ def describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
     velocity_mps = read_vehicle_velocity(tick.motion, tick.at_ns) or tick.velocity_mps
     speed_mps = math.hypot(*velocity_mps)
     if tick.position_m is None:
-        return f"; its position is not known: at {speed_mps:.1f} m/s it may have been too fast to stop in time"
+        return f"; the position is unknown: at {speed_mps:.1f} m/s the vehicle may be too fast to stop in time"
     for approach in list_approaches(tick, parameters, velocity_mps):
         # All axes come to rest together: t = max(v_axis / a_axis, |v| / a); x < v_axis (T + t / 2)
         stop_s = max(approach.speed_mps / approach.brake_mps2, speed_mps / LANDING_MPS2)
@@ -170,4 +170,4 @@ def describe_overrun(tick: Observation, parameters: EnvelopeParameters) -> str:
 def _describe_limit(out_m: float, limit: str, outward_mps: float) -> str:
     """Return how far beyond a limit the vehicle is, and that it could not stop where it flies outward."""
     place = f"{out_m:.1f} m beyond the {limit} limit" if out_m > 0.0 else f"{-out_m:.1f} m before the {limit} limit"
-    return f"{place} at {outward_mps:.1f} m/s, it could not stop in time" if outward_mps > STANDS_MPS else place
+    return f"{place} at {outward_mps:.1f} m/s, too fast to stop in time" if outward_mps > STANDS_MPS else place

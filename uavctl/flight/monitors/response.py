@@ -185,7 +185,7 @@ def update(
         evidence, kind = max((evidence, kind), (onset / ONSET, onset_kind))
     if evidence <= factor * bound:
         return state, NO_VERDICT
-    text = f"the vehicle does not answer setpoints as they say ({kind}), or a strong wind has set in"
+    text = f"the vehicle responds wrongly to setpoints ({kind}), or a strong wind has set in"
     return state, end_plans(EventCode.SETPOINT_RESPONSE, text + describe_overrun(tick, observation.parameters))
 
 

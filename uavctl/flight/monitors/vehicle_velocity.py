@@ -88,7 +88,7 @@ def judge_prediction(observation: VelocityObservation) -> Verdict:
     if velocity is None or _is_near(velocity, observation.predicted_mps, within_mps):
         return NO_VERDICT
     return brake(
-        EventCode.PREDICTION_INCONSISTENT, "the vehicle moves otherwise than was predicted, and no position says why"
+        EventCode.PREDICTION_INCONSISTENT, "the vehicle's velocity contradicts the prediction, and no position arrives"
     )
 
 
@@ -105,7 +105,7 @@ def judge_braking(observation: VelocityObservation) -> Verdict:
     if not (is_opposed and is_faster) or min(speed_mps, predicted_speed_mps) < OPPOSED_MPS:
         return NO_VERDICT
     return end_plans(
-        EventCode.BRAKING, "braking makes the vehicle faster by its own velocity, and slower by the predicted one"
+        EventCode.BRAKING, "braking increases the vehicle's velocity estimate, and decreases the predicted velocity"
     )
 
 

@@ -99,7 +99,7 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
         s, off, bound_m = returned
         state = replace(state, returned=(off, bound_m))
         if math.hypot(*off) > bound_m:
-            text = f"positions came back {describe_vector(off)} m away from the vehicle's own way, after {s:.0f} s"
+            text = f"positions came back after {s:.0f} s, {describe_vector(off)} m off the vehicle's velocity estimate"
             return replace(state, offsets=offsets), end_plans(EventCode.VELOCITY, text)
     points = np.array([point for _, point in offsets])
     slope = _fit_slope(offsets, points, parameters)
@@ -127,11 +127,11 @@ def update(state: VelocityState, observation: PositionObservation) -> tuple[Velo
     state = VelocityState(offsets, places, aligned, apart_mps, is_contradicted, apart_ns, state.returned)
     plain = observation.is_hinted or counted_mps >= PLAIN * bound_mps
     if apart_ns is not None and (plain or at_ns - apart_ns >= PERSISTS_NS):
-        text = f"positions move otherwise than the vehicle itself says, by {describe_vector(apart)} m/s"
+        text = f"velocity by positions differs from the vehicle's velocity estimate by {describe_vector(apart)} m/s"
         return state, end_plans(EventCode.VELOCITY, text)
     if drift is not None:
         s, off = drift
-        text = f"positions have come {describe_vector(off)} m away from the vehicle's own way in {s:.0f} s"
+        text = f"positions drifted {describe_vector(off)} m off the vehicle's velocity estimate in {s:.0f} s"
         return state, end_plans(EventCode.VELOCITY, text)
     return state, NO_VERDICT
 
@@ -144,7 +144,7 @@ def update_silence(state: VelocityState, observation: TickObservation) -> tuple[
         state = replace(state, offsets=(), places=(), aligned=None)
     if state.apart_ns is None or at_ns - state.apart_ns < UNRESOLVED_NS:
         return state, NO_VERDICT
-    text = "positions moved otherwise than the vehicle itself says, and none has come since"
+    text = "velocity by positions differed from the vehicle's velocity estimate, and no position came since"
     return state, end_plans(EventCode.VELOCITY, text)
 
 

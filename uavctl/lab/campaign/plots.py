@@ -170,7 +170,7 @@ STATES = Quantity(
 )
 INPUTS = Quantity(
     "inputs",
-    "Inputs asked for outside the limits",
+    "Requested inputs outside the limits",
     "steps with an input outside [%]",
     lambda c: (c.input_violation_rate, c.input_violation_ci),
     lambda c: c.promised_u,

@@ -180,7 +180,7 @@ def open_cluster(address: str) -> Iterator[Cluster]:
             yield Cluster(client.get_executor(), sum(client.nthreads().values()))
         except CancelledError as error:
             raise UavctlError(
-                f"--dask {address}: the scheduler went away; go on with --resume once it is back"
+                f"--dask {address}: the scheduler went away; continue with --resume once it is back"
             ) from error
 
 

@@ -199,7 +199,7 @@ def _read_rows(paths: Sequence[Path], schema: pa.Schema) -> pa.Table:
         except KeyError as error:
             raise UavctlError(f"{path}: lacks a column ({error.args[0]!s}); give the folder of a campaign") from error
         except (OSError, pa.ArrowException, ValueError, TypeError, MemoryError) as error:
-            raise UavctlError(f"{path} is damaged ({error}); remove it and go on with --resume") from error
+            raise UavctlError(f"{path} is damaged ({error}); remove it and continue with --resume") from error
     return pa.concat_tables(tables)
 
 

@@ -77,9 +77,9 @@ class Store:
             UsageError: There is none to continue, or one although `resume` is false.
         """
         if self.has_campaign() and not resume:
-            raise UsageError(f"{self.folder} holds a campaign; go on with it by --resume, or choose another folder")
+            raise UsageError(f"{self.folder} holds a campaign; continue it with --resume, or choose another folder")
         if resume and not self.has_campaign():
-            raise UsageError(f"{self.folder} holds no campaign that could go on; leave out --resume")
+            raise UsageError(f"{self.folder} holds no campaign to continue; leave out --resume")
 
     def find_finished(self, tasks: Sequence[Work]) -> set[str]:
         """Return the names of the finished tasks."""
@@ -103,7 +103,7 @@ class Store:
             yield
         except OSError as error:
             raise UavctlError(
-                f"{self.folder}: {error.strerror or error}; make room or mend it, and go on with --resume"
+                f"{self.folder}: {error.strerror or error}; make room or repair it, and continue with --resume"
             ) from error
 
     def _get_path(self, task: Work) -> Path:

@@ -25,10 +25,10 @@ _SCENARIO_TITLES = {
     "blackout": "Four seconds without any position",
 }
 _OWN_LOOP_NOTE = (
-    "`own-loop` is the vehicle's own position loop: its estimator gets the very positions that the others get on the "
-    "same flight, and nothing else, and it is told where to be, or along a motion position, velocity and acceleration. "
-    "The simulated vehicle's inertial sensors are nearly perfect (a constant bias, no noise, attitude without error), "
-    "so what it does without positions is better than a real one's."
+    "`own-loop` is the vehicle's own position loop. Its estimator gets the positions of the same flight, and nothing "
+    "else. Its setpoint is the target, or position, velocity and acceleration of the motion. The simulated inertial "
+    "sensors are nearly perfect: a constant bias, no noise, no error of attitude. So `own-loop` flies better without "
+    "positions than a real vehicle."
 )
 
 

@@ -208,34 +208,33 @@ _SECTIONS: tuple[PageSection[_IdentifyView], ...] = (
     PageSection(
         "Response",
         _show_response,
-        note="With the dead time below, one for all axes. ± is the standard error with that dead time. The wind is the "
+        note="All axes have one dead time. ± is the standard error with that dead time. The wind is the "
         "standard deviation of an acceleration that is constant over a step.",
     ),
     PageSection(
         "Dead time and plant",
         _show_dead_time,
-        note="The dead time is the likeliest for the whole flight and all axes, its range where the deviance is less "
-        "than 4 above its least. The errors compare plants: fitted to one half of the flight and judged by the other, "
-        "blocks of 8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints "
-        "known.",
+        note="The dead time is the likeliest for the whole flight and all axes. In its range the deviance is less than "
+        "4 above its least. The errors compare plants. Each plant is fitted to one half of the flight and judged by "
+        "the other, blocks of 8 s in turn. An error is the rms of the motion of the next seconds; setpoints are known.",
     ),
     PageSection(
         f"Motion of the next {R2_AHEAD_S:g} s",
         lambda view: (_draw_motion(name, prediction) for name, prediction in view.axes),
-        note="Each dot is a position: how far the vehicle went from there, and how far the model said it would.",
+        note="Each dot is a position: the distance flown from there, and the distance that the model predicted.",
     ),
     PageSection(
         "Spread ahead",
         _show_spread,
-        note="How far positions were from their predictions over that time, divided by the standard deviation σ that "
-        "plans keep multiples of: 1 is right, above 1 plans come too near to limits. By the identified configuration, "
-        "and by the one before; both without inertial data.",
+        note="Distance of positions from their predictions over that time, divided by the predicted standard deviation "
+        "σ. Back-offs are multiples of σ: 1 is right; above 1 plans come too near to limits. The columns are the "
+        "identified configuration and the one before, both without inertial data.",
     ),
     PageSection(
         "Unexplained rest",
         _draw_residuals,
-        note="Each position minus its prediction from those before: with a right model, 95 % are between the lines, "
-        "and one does not tell the next (correlations within the band).",
+        note="Each position minus its prediction from earlier positions. If the model is right, 95 % are between the "
+        "lines, and successive ones are independent (correlations within the band).",
     ),
     PageSection(
         "Link",

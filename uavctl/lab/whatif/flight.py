@@ -353,7 +353,7 @@ class _ReflownLoop:
         ending = next(iter(self._history.flight.endings[-1:]), None)
         if ending is not None and ending.code in TAKEN:
             return CAUSES[Cause(ending.code)].phrase
-        return "no setpoint of the recording flies the vehicle any more"
+        return "the recording has no more setpoints that fly the vehicle"
 
     def _move_inputs(self, inputs: StepInput) -> StepInput:
         """Return the inputs of the other course: positions by its link, and all measurements moved by δ."""
