@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, zip_longest
@@ -71,6 +71,7 @@ TABLE_PERIOD_S = 5.0  # between two tables where there is no terminal
 MAX_VEHICLES = 20
 MAX_NAME_LENGTH = 30
 REST_S = 3.0  # longest time to come to rest in cells before the landing: a plan is 2.4 s long
+ORDERED = "x"  # before standard input of a daemon is closed: the end is ordered, not that of a killed fleet
 COORDINATOR_FILE = "coordinator.mcap"
 CELLS_OVERRIDE = "mission.cells=true"
 
@@ -436,7 +437,8 @@ class FleetFlight:
 
     def __init__(self, member: Member, options: Sequence[str]) -> None:
         self.member = member
-        daemon_code = "from uavctl.cli.fleet import run_fleet_daemon; run_fleet_daemon()"
+        rest_s = REST_S if member.config.mission.cells else 0.0
+        daemon_code = f"from uavctl.cli.fleet import run_fleet_daemon; run_fleet_daemon({rest_s})"
         self._command = [sys.executable, "-P", "-c", daemon_code, "fly", *member.options, *options]
         self._process: subprocess.Popen[str] | None = None
         self._output_thread = threading.Thread(target=self._print_output, name=member.name, daemon=True)
@@ -467,8 +469,10 @@ class FleetFlight:
 
     def request_fallback(self) -> None:
         """Request the end, as Ctrl-C does: the vehicle brakes, holds, and lands or is handed over."""
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()
+        if self._process is not None and self._process.stdin is not None and not self._process.stdin.closed:
+            with suppress(OSError):  # the daemon has ended
+                self._process.stdin.write(ORDERED)
+                self._process.stdin.close()
 
     def join_output(self) -> None:
         """Wait until the output of the daemon is printed, not for a child process that keeps it open."""
@@ -569,16 +573,22 @@ def coordinate(fleet: Fleet, parameters: CellParameters, path: Path) -> Iterator
             thread.join(TABLE_PERIOD_S)
 
 
-def run_fleet_daemon() -> None:
+def run_fleet_daemon(rest_s: float) -> None:
     """Run the command line as a daemon of a fleet; raise Ctrl-C once standard input is closed.
 
     The fleet closes it, or the system if the fleet's process is killed: then nothing supervises the spacing.
+
+    Args:
+        rest_s: Time to come to rest in the last cell if the process is killed [s]; braking leaves a cell.
     """
 
     def wait_for_close() -> None:
+        is_ordered = False
         # Without `sys.stdin`: this thread would hold its lock, and the interpreter would abort at its end.
         while os.read(0, 1):
-            pass
+            is_ordered = True
+        if not is_ordered:
+            time.sleep(rest_s)
         signal.raise_signal(signal.SIGINT)
 
     threading.Thread(target=wait_for_close, name="fleet", daemon=True).start()
