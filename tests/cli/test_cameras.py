@@ -27,7 +27,7 @@ from logs.recording.sender import TOPIC
 from sim.fleet import make_fleet
 from sim.server import serve_all
 from uavctl.cli.app import run
-from uavctl.cli.fleet import read_fleet
+from uavctl.cli.fleet_file import read_fleet
 from uavctl.config import load_config
 from uavctl.io.key_file import new_key, read_key
 from uavctl.io.signed_connection import sign_connections

@@ -30,7 +30,8 @@ from logs.report.fleet import read_fleet as read_flown_fleet
 from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
 from uavctl.cli.ctl import send_request
-from uavctl.cli.fleet import FleetFlight, Member, compute_gap_m, read_fleet
+from uavctl.cli.fleet import FleetFlight
+from uavctl.cli.fleet_file import Member, compute_gap_m, read_fleet
 from uavctl.cli.fleet_view import choose_ports
 from uavctl.config import load_config
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest

@@ -11,7 +11,7 @@ from places import ROOT
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.cameras import Cameras
-from uavctl.cli.fleet import read_fleet
+from uavctl.cli.fleet_file import read_fleet
 from uavctl.config import Config, load
 from uavctl.frames import Quaternion
 from uavctl.io.shared_sources import find_shared_sources

@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from logs.recording.ends import make_recording_path
 from logs.recording.sender import SenderRecording
 from uavctl.cli.common import SPAN_S, Common, QuietJson
-from uavctl.cli.fleet import Fleet, Member, read_fleet
+from uavctl.cli.fleet_file import Fleet, Member, read_fleet
 from uavctl.cli.output import make_table, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.clock import monotonic_ns, read_zero_utc_ns

@@ -16,13 +16,13 @@ import msgspec
 from uavctl.arrays import Array
 from uavctl.flight.context import FilterView, TickContext, expand_axes, read_position, read_velocity
 from uavctl.flight.decide import (
-    Decided,
     are_positions_compared,
     carries_estimate,
     find_braking_velocity,
     find_hold_accel,
     find_retreat_velocity,
 )
+from uavctl.flight.decided import Decided
 from uavctl.flight.estimator import FilterHistory, PendingInputs, drop_samples, note_input
 from uavctl.flight.fallback import Fallback, FallbackReason, compute_brake_accel, compute_return_accel, keep_from_limits
 from uavctl.flight.kalman import read_capture_ns

@@ -15,25 +15,14 @@ import math
 import operator
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.arrays import Array
-from uavctl.fleet.cell import MovingCell, PlannedPath, parse_cell
+from uavctl.fleet.cell import parse_cell
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias, remove_drag_from_bias
-from uavctl.flight.cells import (
-    CellGroup,
-    add_cell,
-    choose_cell,
-    is_at_landing_place,
-    leave_cells,
-    limit_preview,
-    locate_plan,
-    refuse_cell,
-)
+from uavctl.flight.cells import add_cell, is_at_landing_place, leave_cells
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
-from uavctl.flight.controller import Controller
+from uavctl.flight.decided import Decided, Phase
 from uavctl.flight.estimator import make_estimate, select_covariance
 from uavctl.flight.fallback import (
     Fallback,
@@ -46,16 +35,14 @@ from uavctl.flight.fallback import (
 )
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
-from uavctl.flight.mission import MissionState, advance_mission, is_led, is_over, lead_with_one_axis, make_question
+from uavctl.flight.mission import advance_mission, is_over
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.monitors.velocity import CORRECTS_NS
-from uavctl.flight.orders import Ordered, describe_order, follow_order
-from uavctl.flight.risk import set_risk
-from uavctl.flight.solve import SolveOutcome, ask_solver
-from uavctl.flight.state import ControlState, find_mode
+from uavctl.flight.orders import Ordered
+from uavctl.flight.replan import replan
+from uavctl.flight.state import ControlState
 from uavctl.flight.supervise import RETURNED_NS, Supervised, are_positions_lost, observe_velocity
-from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
-from uavctl.smpc.answer import Preview
+from uavctl.records import ControlMode, Vec3, moves_now
 from uavctl.smpc.plant import Plant
 
 MISSION_OVER = "the mission is over: landing"
@@ -65,12 +52,6 @@ COMPARED_NS = CORRECTS_NS + 400_000_000
 # The vehicle's own velocity has to confirm them within this time: a wrong one is believed again after 1.4 s at the
 # earliest; one that has stopped comes back when they do, or not at all.
 RIGHT_AGAIN_NS, BACK_AGAIN_NS = 2_000_000_000, 1_000_000_000
-# Plans after HOLD accelerate no more than this for so long. Positions that came back wrong contradict the vehicle's own
-# velocity once it moves, after half a second: with 3 m/s² it is at 1.5 m/s by then.
-AFTER_HOLD_NS, AFTER_HOLD_MPS2 = 1_500_000_000, 0.7
-# Age of a position up to which inertial data alone, without the vehicle's own velocity, make a new plan: nothing would
-# show that they err. With five positions a second and 60 % of them lost, one in ten is older.
-MAX_UNCONFIRMED_NS = 1_000_000_000
 MAX_INERTIAL_AGE_NS = 200_000_000  # inertial data that are older do not carry the estimate on
 BESIDE_OBSTACLE = "a vehicle without a cell may come near: landing"
 _FINAL_TEXTS = {
@@ -83,58 +64,9 @@ _FINAL_TEXTS = {
 }
 
 
-class Decided(msgspec.Struct, frozen=True, eq=False):
-    """Result of phase 4: mode and input, with the reason."""
-
-    plan: Plan | None
-    superseded_after_ns: int | None  # a position that was captured after this time supersedes the plan
-    fallback: Fallback | None
-    mission: MissionState | None
-    order: Command | None  # order that still waits for a plan
-    consecutive_samples: int  # fresh samples in a row
-    hold_point_m: Vec3 | None
-    left_hold_ns: int | None  # boundary of the first plan after the last HOLD [ns]; None before
-    biases: Biases
-    jump_suspected: bool
-    fault: str  # why a controller of another package is given up; empty as long as it is not
-    cells: CellGroup  # moving cells
-    reason: str = ""
-    new_measurement: bool = False  # whether a new position was there at the boundary
-    solve: SolveStatus | None = None  # outcome of the solve; None if none was asked
-    new_plan: Plan | None = None
-    trouble: str = ""  # why the answer does not fly
-    sends_nothing: bool = False  # whether nothing may be sent in this tick
-
-    @property
-    def mode(self) -> ControlMode:
-        """The control mode."""
-        return find_mode(self.plan, self.fallback)
-
-
-class _Phase(msgspec.Struct, frozen=True, eq=False):
-    """Data of the steps of this phase."""
-
-    state: ControlState
-    context: TickContext
-    supervised: Supervised
-
-    @property
-    def controller(self) -> Controller:
-        return self.context.controller
-
-    @property
-    def view(self) -> FilterView:
-        return self.supervised.view
-
-    @property
-    def wanted_samples(self) -> int:
-        """Fresh positions in a row before plans fly again."""
-        return self.controller.fallback.recover_samples
-
-
 def decide(state: ControlState, context: TickContext, supervised: Supervised, ordered: Ordered) -> Decided:
     """Decide the mode: wait, plan, or fallback."""
-    phase = _Phase(state, context, supervised)
+    phase = Phase(state, context, supervised)
     draft = _apply_requests(phase, ordered)
     decided = _decide_handed_over(draft, phase) or _decide_fallback(draft, phase) or _decide_plan(draft, phase)
     if context.controller.cell_rows is not None and decided.mode is not ControlMode.TRACK:
@@ -142,7 +74,7 @@ def decide(state: ControlState, context: TickContext, supervised: Supervised, or
     return decided
 
 
-def _apply_requests(phase: _Phase, ordered: Ordered) -> Decided:
+def _apply_requests(phase: Phase, ordered: Ordered) -> Decided:
     """Apply the changes by orders, monitors and the operator's stop."""
     state, supervised, at_ns = phase.state, phase.supervised, phase.context.at_ns
     fallback = ordered.fallback
@@ -191,7 +123,7 @@ def _find_superseded_after_ns(state: ControlState, supervised: Supervised) -> in
     return dropped_after_ns - 1
 
 
-def _update_biases(phase: _Phase) -> Biases:
+def _update_biases(phase: Phase) -> Biases:
     """Return the recent biases, without those from samples that were dropped, and with that of a new measurement."""
     biases, context, view = phase.state.fallback.biases, phase.context, phase.view
     dropped_after_ns = phase.supervised.dropped_after_ns
@@ -206,7 +138,7 @@ def _update_biases(phase: _Phase) -> Biases:
     return remember_bias(biases, context.boundary_ns, bias)
 
 
-def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
+def _decide_handed_over(draft: Decided, phase: Phase) -> Decided | None:
     """Decide for a vehicle that is handed over, stopped, not heard, or takes no setpoints; None for any other."""
     inputs, why_not = phase.context.inputs, phase.context.not_ready_reason
     at_ns, fallback = phase.context.at_ns, draft.fallback
@@ -227,7 +159,7 @@ def _decide_handed_over(draft: Decided, phase: _Phase) -> Decided | None:
     return None
 
 
-def _decide_fallback(draft: Decided, phase: _Phase) -> Decided | None:
+def _decide_fallback(draft: Decided, phase: Phase) -> Decided | None:
     """Decide for a final fallback, or a verdict to brake; None without either."""
     supervised, fallback = phase.supervised, draft.fallback
     if fallback is not None and fallback.is_final:
@@ -242,7 +174,7 @@ def _decide_fallback(draft: Decided, phase: _Phase) -> Decided | None:
     return None
 
 
-def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
+def _decide_plan(draft: Decided, phase: Phase) -> Decided:
     """Decide for a vehicle that takes setpoints, with nothing against a plan."""
     if not phase.context.is_boundary:
         if draft.fallback is not None:
@@ -270,7 +202,7 @@ def _decide_plan(draft: Decided, phase: _Phase) -> Decided:
     return _plan_from(draft, phase.supervised.plan_base, phase)
 
 
-def _plan_from(draft: Decided, belief: Belief, phase: _Phase) -> Decided:
+def _plan_from(draft: Decided, belief: Belief, phase: Phase) -> Decided:
     """Plan from the belief at which an input begins to act, unless the mission is over or the controller has failed."""
     controller, context, supervised = phase.controller, phase.context, phase.supervised
     base = make_estimate(controller.kalman, belief, with_cov=False)
@@ -287,7 +219,7 @@ def _plan_from(draft: Decided, belief: Belief, phase: _Phase) -> Decided:
         draft = replace(draft, fault=supervised.wall.text)
     if draft.fault:  # found just now, or the vehicle is flown again after the pilot had it
         return _give_up_controller(draft, phase)
-    planned = _replan(draft, mission, base, select_covariance(controller.kalman, belief), phase)
+    planned = replan(draft, mission, base, select_covariance(controller.kalman, belief), phase)
     if planned.fault:
         return _give_up_controller(planned, phase)
     if planned.plan is not None and context.step - planned.plan.seq < controller.horizon:
@@ -295,173 +227,13 @@ def _plan_from(draft: Decided, belief: Belief, phase: _Phase) -> Decided:
     return _fall_back(planned, draft.fallback or begin_fallback(context.at_ns), phase, "no plan is left")
 
 
-def _replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, phase: _Phase) -> Decided:
-    """Ask for a plan if there is new data, as ordered; without it, or without an answer, the old plan is flown on."""
-    controller, context = phase.controller, phase.context
-    before_ns = None if draft.plan is None else draft.superseded_after_ns
-    new_measurement = before_ns is None or base.captured_ns > before_ns
-    before_cells = draft.cells
-    draft = _choose_cell_by_plan(draft, phase)
-    if new_measurement:
-        reason = "new position: new plan"
-    elif _has_new_inertial(draft.plan, phase):
-        reason = "new IMU data: new plan"
-    elif draft.cells is not before_cells or draft.cells.pending is not None:
-        reason = "new cell: new plan"
-    else:
-        return replace(draft, reason="no new position: the plan continues")
-    if draft.order is not None:
-        reason = f"{reason}, as ordered: {describe_order(draft.order)}"
-    mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
-    if draft.fallback is not None and draft.fallback.mode is ControlMode.HOLD:
-        draft = replace(draft, left_hold_ns=context.boundary_ns)
-    if controller.cell_rows is None or draft.cells.choice.cell is not None:  # without a cell, it stays
-        mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
-    target, preview = make_question(controller.mission, mission, context.boundary_ns)
-    is_first = is_led(controller.mission, mission, context.boundary_ns)
-    preview = set_risk(preview, phase.state.risk, controller.risk, is_led=is_first)
-    preview = _complete_preview(preview, base, cov, draft, phase)
-    if controller.cell_rows is None:
-        asked = _ask(base, target, preview, phase)
-    else:
-        draft, asked = _plan_in_cell(draft, base, target if is_first else None, preview, phase)
-    draft = replace(draft, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
-    if asked.plan is None:
-        reason = "no new plan: the old plan continues"
-        return replace(draft, reason=reason, fault=asked.fault, trouble=asked.text)
-    return replace(
-        draft,
-        plan=asked.plan,
-        superseded_after_ns=asked.plan.captured_ns,
-        fallback=None,
-        new_plan=asked.plan,
-        reason=reason,
-    )
-
-
-def _ask(base: Estimate, target: Array, preview: Preview, phase: _Phase) -> SolveOutcome:
-    """Ask the solver for a plan."""
-    controller = phase.controller
-    shape = (controller.horizon, controller.plant.n_u)
-    return ask_solver(controller.solver, phase.context.step, base, target, preview, shape, controller.design_id)
-
-
-def _choose_cell_by_plan(draft: Decided, phase: _Phase) -> Decided:
-    """Take the cell that waits if the plan in progress keeps it."""
-    if draft.cells.pending is None or draft.plan is None or phase.controller.cell_rows is None:
-        return draft
-    return replace(draft, cells=choose_cell(draft.cells, _locate(draft.plan, phase)))
-
-
-def _locate(plan: Plan, phase: _Phase) -> PlannedPath:
-    """Locate a plan at the steps of the common clock, from this boundary on."""
-    controller, rows = phase.controller, phase.controller.cell_rows
-    assert rows is not None
-    position_m = read_position(phase.view.estimate, controller.plant)
-    return locate_plan(plan, rows, phase.context.boundary_ns, controller.dt_ns, position_m)
-
-
-def _plan_in_cell(
-    draft: Decided, base: Estimate, target: Array | None, preview: Preview, phase: _Phase
-) -> tuple[Decided, SolveOutcome]:
-    """Plan inside of the cell that waits, and take it if the plan keeps it; else inside of the one in use.
-
-    Args:
-        target: Equilibrium to go to (n_x,); None: the goal of the cell.
-    """
-    pending = draft.cells.pending
-    if pending is not None:
-        asked = _ask_in_cell(pending, base, target, preview, phase)
-        cells = draft.cells if asked.plan is None else choose_cell(draft.cells, _locate(asked.plan, phase))
-        if cells is not draft.cells:
-            return replace(draft, cells=cells), asked
-        draft = replace(draft, cells=refuse_cell(draft.cells))
-    if draft.cells.choice.cell is not None:
-        return draft, _ask_in_cell(draft.cells.choice.cell, base, target, preview, phase)
-    region, rest = phase.controller.mission.rest_region, draft.cells.rest
-    if rest is None:
-        rest = base.mean if region is None else region.find_stop(base.mean)
-    preview = msgspec.structs.replace(preview, path=None)
-    return replace(draft, cells=replace(draft.cells, rest=rest)), _ask(base, np.array(rest), preview, phase)
-
-
-def _ask_in_cell(
-    cell: MovingCell, base: Estimate, target: Array | None, preview: Preview, phase: _Phase
-) -> SolveOutcome:
-    """Ask the solver for a plan inside of a cell, to its goal or to another target."""
-    controller, rows = phase.controller, phase.controller.cell_rows
-    assert rows is not None
-    if target is None:
-        north, east, down = cell.goal_m.tolist()
-        target = controller.plant.equilibrium((north, east, down))
-    limits, horizon = controller.mission.limits, controller.horizon
-    bounded = limit_preview(preview, cell, rows, limits, base.at_ns, controller.dt_ns, horizon)
-    return _ask(base, target, bounded, phase)
-
-
-def _complete_preview(preview: Preview, base: Estimate, cov: Array, draft: Decided, phase: _Phase) -> Preview:
-    """Add data of the estimate and the last input to the question."""
-    controller = phase.controller
-    # u = u_sent + d: the solver counts what acts on the plant in all
-    sent = controller.plant.to_input(phase.state.plan.sent_mps2)
-    return msgspec.structs.replace(
-        preview,
-        age=min(phase.view.age_steps or 0, controller.late_steps),
-        cov=cov,
-        sent=sent + np.array(base.bias) if base.bias else sent,
-        input_bounds=_find_input_bounds(base.bias, draft.left_hold_ns, phase),
-        sent_mps2=_select_axes(phase.state.plan.sent_mps2, controller.plant),
-        braking=controller.braking if controller.outside else None,
-    )
-
-
-def _select_axes(vector: Vec3, plant: Plant) -> Array:
-    """Return the entries (n_axes,) of a vector that the plant has."""
-    return np.array([vector[AXES.index(axis)] for axis in plant.axes])
-
-
-def _find_input_bounds(bias: Vector, left_hold_ns: int | None, phase: _Phase) -> tuple[Array, Array] | None:
-    """Find the least and largest input of a plan, bias included; None where they are those of the design."""
-    controller = phase.controller
-    bounds = _shift_input_bounds(bias, controller)
-    is_new = left_hold_ns is not None and phase.context.boundary_ns - left_hold_ns < AFTER_HOLD_NS
-    if not is_new or controller.input_bounds is None:
-        return bounds
-    low, high = bounds or controller.input_bounds
-    push = np.array(bias) if bias else np.zeros(len(low))
-    # |u - d| ≤ 0.7 m/s²
-    return np.maximum(low, push - AFTER_HOLD_MPS2), np.minimum(high, push + AFTER_HOLD_MPS2)
-
-
-def _shift_input_bounds(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
-    """Return the least and largest input of a plan, bias included; None where the design has a margin for the bias."""
-    if controller.input_bounds is None or not bias or max(map(abs, bias)) <= controller.estimator.bias_max:
-        return None
-    low, high = controller.input_bounds
-    # u = u_sent + d
-    return low + bias, high + bias
-
-
-def _has_new_inertial(plan: Plan | None, phase: _Phase) -> bool:
-    """Whether inertial data have come since the plan was made, and the solver counts the age of its position."""
-    view, controller, context = phase.view, phase.controller, phase.context
-    if plan is None or (view.age_steps or 0) > controller.late_steps:
-        return False
-    inputs, belief = context.inputs, view.belief
-    alone = find_confirmed_velocity(phase.supervised.monitors.engaged, inputs.motion, inputs.at_ns) is None
-    if alone and belief is not None and context.boundary_ns - belief.captured_ns > MAX_UNCONFIRMED_NS:
-        return False
-    newest_ns = None if belief is None else belief.inertial.used_ns
-    return newest_ns is not None and newest_ns > plan.base_ns - controller.dead_ns
-
-
-def _give_up_controller(draft: Decided, phase: _Phase) -> Decided:
+def _give_up_controller(draft: Decided, phase: Phase) -> Decided:
     """Let the fallback fly for good: the controller of another package has failed."""
     fallback = request_fallback(draft.fallback, FallbackReason.CONTROLLER_FAILED, phase.context.at_ns)
     return _fall_back(draft, fallback, phase, draft.fault)
 
 
-def _fall_back(draft: Decided, fallback: Fallback, phase: _Phase, reason: str) -> Decided:
+def _fall_back(draft: Decided, fallback: Fallback, phase: Phase, reason: str) -> Decided:
     """Let the fallback fly, and advance it; the count of fresh samples starts anew where it begins."""
     before, fallback = fallback, _advance(draft, fallback, phase)
     if fallback.mode is ControlMode.LAND and not fallback.is_final:
@@ -478,7 +250,7 @@ def _fall_back(draft: Decided, fallback: Fallback, phase: _Phase, reason: str) -
     )
 
 
-def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Decided:
+def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: Phase) -> Decided:
     """Let the fallback's time run on while the vehicle is not heard.
 
     Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime. Where it is due
@@ -502,7 +274,7 @@ def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: _Phase) -> Deci
     return replace(draft, plan=None, fallback=later, consecutive_samples=consecutive, reason=reason)
 
 
-def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
+def _advance(draft: Decided, fallback: Fallback, phase: Phase) -> Fallback:
     """Advance the fallback to this tick."""
     state, context, view = phase.state, phase.context, phase.view
     moving, measured = find_braking_velocity(fallback, draft.biases, context, phase.supervised)
@@ -520,7 +292,7 @@ def _advance(draft: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
     )
 
 
-def _is_velocity_lost(phase: _Phase) -> bool:
+def _is_velocity_lost(phase: Phase) -> bool:
     """Whether the vehicle's own velocity confirms no position, or is wrong, and repeats, or no position comes."""
     if _confirms_no_position(phase):
         return True
@@ -531,7 +303,7 @@ def _is_velocity_lost(phase: _Phase) -> bool:
     return change.repeats(at_ns) or are_positions_lost(supervised.view.belief, at_ns)
 
 
-def _confirms_no_position(phase: _Phase) -> bool:
+def _confirms_no_position(phase: Phase) -> bool:
     """Whether positions are back, and the vehicle's own velocity has been missing for longer than it is waited for."""
     supervised, at_ns = phase.supervised, phase.context.at_ns
     monitors, change = supervised.monitors.engaged, supervised.monitors.engaged.velocity_change

@@ -16,7 +16,7 @@ import numpy as np
 from uavctl.constraint_names import describe_all_relaxed
 from uavctl.event_codes import MISSION, EventCode
 from uavctl.flight.context import TickContext
-from uavctl.flight.decide import Decided
+from uavctl.flight.decided import Decided
 from uavctl.flight.estimator import find_newest_belief
 from uavctl.flight.fallback import Fallback, FallbackReason
 from uavctl.flight.link_estimate import LinkCounts, count_step, estimate_link

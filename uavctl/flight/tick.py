@@ -16,7 +16,8 @@ from uavctl.flight.act import Acted, act
 from uavctl.flight.cells import describe_decision
 from uavctl.flight.context import TickContext, locate_on_grid
 from uavctl.flight.controller import Controller
-from uavctl.flight.decide import Decided, decide
+from uavctl.flight.decide import decide
+from uavctl.flight.decided import Decided
 from uavctl.flight.events import Reported, report_events
 from uavctl.flight.limits import ZERO
 from uavctl.flight.measure import Measured, measure
