@@ -1,4 +1,4 @@
-"""Phase 4 of a tick: make a new plan, continue the old one, or fall back.
+"""PhaseData 4 of a tick: make a new plan, continue the old one, or fall back.
 
 1. The operator's orders change the fallback, then verdicts that end the plans, then the operator's stop.
 2. A vehicle that is handed over, is not heard, or takes no setpoints gets no plan. After a long gap between ticks
@@ -22,7 +22,7 @@ from uavctl.fleet.cell import parse_cell
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias, remove_drag_from_bias
 from uavctl.flight.cells import add_cell, is_at_landing_place, leave_cells
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
-from uavctl.flight.decided import Decided, Phase
+from uavctl.flight.decided import Decided, PhaseData
 from uavctl.flight.estimator import make_estimate, select_covariance
 from uavctl.flight.fallback import (
     Fallback,
@@ -66,7 +66,7 @@ _FINAL_TEXTS = {
 
 def decide(state: ControlState, context: TickContext, supervised: Supervised, ordered: Ordered) -> Decided:
     """Decide the mode: wait, plan, or fallback."""
-    phase = Phase(state, context, supervised)
+    phase = PhaseData(state, context, supervised)
     draft = _apply_requests(phase, ordered)
     decided = _decide_handed_over(draft, phase) or _decide_fallback(draft, phase) or _decide_plan(draft, phase)
     if context.controller.cell_rows is not None and decided.mode is not ControlMode.TRACK:
@@ -74,7 +74,7 @@ def decide(state: ControlState, context: TickContext, supervised: Supervised, or
     return decided
 
 
-def _apply_requests(phase: Phase, ordered: Ordered) -> Decided:
+def _apply_requests(phase: PhaseData, ordered: Ordered) -> Decided:
     """Apply the changes by orders, monitors and the operator's stop."""
     state, supervised, at_ns = phase.state, phase.supervised, phase.context.at_ns
     fallback = ordered.fallback
@@ -123,7 +123,7 @@ def _find_superseded_after_ns(state: ControlState, supervised: Supervised) -> in
     return dropped_after_ns - 1
 
 
-def _update_biases(phase: Phase) -> Biases:
+def _update_biases(phase: PhaseData) -> Biases:
     """Return the recent biases, without those from samples that were dropped, and with that of a new measurement."""
     biases, context, view = phase.state.fallback.biases, phase.context, phase.view
     dropped_after_ns = phase.supervised.dropped_after_ns
@@ -138,7 +138,7 @@ def _update_biases(phase: Phase) -> Biases:
     return remember_bias(biases, context.boundary_ns, bias)
 
 
-def _decide_handed_over(draft: Decided, phase: Phase) -> Decided | None:
+def _decide_handed_over(draft: Decided, phase: PhaseData) -> Decided | None:
     """Decide for a vehicle that is handed over, stopped, not heard, or takes no setpoints; None for any other."""
     inputs, why_not = phase.context.inputs, phase.context.not_ready_reason
     at_ns, fallback = phase.context.at_ns, draft.fallback
@@ -159,7 +159,7 @@ def _decide_handed_over(draft: Decided, phase: Phase) -> Decided | None:
     return None
 
 
-def _decide_fallback(draft: Decided, phase: Phase) -> Decided | None:
+def _decide_fallback(draft: Decided, phase: PhaseData) -> Decided | None:
     """Decide for a final fallback, or a verdict to brake; None without either."""
     supervised, fallback = phase.supervised, draft.fallback
     if fallback is not None and fallback.is_final:
@@ -174,7 +174,7 @@ def _decide_fallback(draft: Decided, phase: Phase) -> Decided | None:
     return None
 
 
-def _decide_plan(draft: Decided, phase: Phase) -> Decided:
+def _decide_plan(draft: Decided, phase: PhaseData) -> Decided:
     """Decide for a vehicle that takes setpoints, with nothing against a plan."""
     if not phase.context.is_boundary:
         if draft.fallback is not None:
@@ -202,7 +202,7 @@ def _decide_plan(draft: Decided, phase: Phase) -> Decided:
     return _plan_from(draft, phase.supervised.plan_base, phase)
 
 
-def _plan_from(draft: Decided, belief: Belief, phase: Phase) -> Decided:
+def _plan_from(draft: Decided, belief: Belief, phase: PhaseData) -> Decided:
     """Plan from the belief at which an input begins to act, unless the mission is over or the controller has failed."""
     controller, context, supervised = phase.controller, phase.context, phase.supervised
     base = make_estimate(controller.kalman, belief, with_cov=False)
@@ -227,13 +227,13 @@ def _plan_from(draft: Decided, belief: Belief, phase: Phase) -> Decided:
     return _fall_back(planned, draft.fallback or begin_fallback(context.at_ns), phase, "no plan is left")
 
 
-def _give_up_controller(draft: Decided, phase: Phase) -> Decided:
+def _give_up_controller(draft: Decided, phase: PhaseData) -> Decided:
     """Let the fallback fly for good: the controller of another package has failed."""
     fallback = request_fallback(draft.fallback, FallbackReason.CONTROLLER_FAILED, phase.context.at_ns)
     return _fall_back(draft, fallback, phase, draft.fault)
 
 
-def _fall_back(draft: Decided, fallback: Fallback, phase: Phase, reason: str) -> Decided:
+def _fall_back(draft: Decided, fallback: Fallback, phase: PhaseData, reason: str) -> Decided:
     """Let the fallback fly, and advance it; the count of fresh samples starts anew where it begins."""
     before, fallback = fallback, _advance(draft, fallback, phase)
     if fallback.mode is ControlMode.LAND and not fallback.is_final:
@@ -250,7 +250,7 @@ def _fall_back(draft: Decided, fallback: Fallback, phase: Phase, reason: str) ->
     )
 
 
-def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: Phase) -> Decided:
+def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: PhaseData) -> Decided:
     """Let the fallback's time run on while the vehicle is not heard.
 
     Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime. Where it is due
@@ -274,7 +274,7 @@ def _wait_for_vehicle(draft: Decided, fallback: Fallback, phase: Phase) -> Decid
     return replace(draft, plan=None, fallback=later, consecutive_samples=consecutive, reason=reason)
 
 
-def _advance(draft: Decided, fallback: Fallback, phase: Phase) -> Fallback:
+def _advance(draft: Decided, fallback: Fallback, phase: PhaseData) -> Fallback:
     """Advance the fallback to this tick."""
     state, context, view = phase.state, phase.context, phase.view
     moving, measured = find_braking_velocity(fallback, draft.biases, context, phase.supervised)
@@ -292,7 +292,7 @@ def _advance(draft: Decided, fallback: Fallback, phase: Phase) -> Fallback:
     )
 
 
-def _is_velocity_lost(phase: Phase) -> bool:
+def _is_velocity_lost(phase: PhaseData) -> bool:
     """Whether the vehicle's own velocity confirms no position, or is wrong, and repeats, or no position comes."""
     if _confirms_no_position(phase):
         return True
@@ -303,7 +303,7 @@ def _is_velocity_lost(phase: Phase) -> bool:
     return change.repeats(at_ns) or are_positions_lost(supervised.view.belief, at_ns)
 
 
-def _confirms_no_position(phase: Phase) -> bool:
+def _confirms_no_position(phase: PhaseData) -> bool:
     """Whether positions are back, and the vehicle's own velocity has been missing for longer than it is waited for."""
     supervised, at_ns = phase.supervised, phase.context.at_ns
     monitors, change = supervised.monitors.engaged, supervised.monitors.engaged.velocity_change

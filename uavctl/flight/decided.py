@@ -43,7 +43,7 @@ class Decided(msgspec.Struct, frozen=True, eq=False):
         return find_mode(self.plan, self.fallback)
 
 
-class Phase(msgspec.Struct, frozen=True, eq=False):
+class PhaseData(msgspec.Struct, frozen=True, eq=False):
     """Data of the steps of phase 4."""
 
     state: ControlState

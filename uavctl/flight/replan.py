@@ -17,7 +17,7 @@ from uavctl.fleet.cell import MovingCell, PlannedPath
 from uavctl.flight.cells import choose_cell, limit_preview, locate_plan, refuse_cell
 from uavctl.flight.context import read_position
 from uavctl.flight.controller import Controller
-from uavctl.flight.decided import Decided, Phase
+from uavctl.flight.decided import Decided, PhaseData
 from uavctl.flight.limits import AXES
 from uavctl.flight.mission import MissionState, is_led, lead_with_one_axis, make_question
 from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity
@@ -36,7 +36,7 @@ AFTER_HOLD_NS, AFTER_HOLD_MPS2 = 1_500_000_000, 0.7
 MAX_UNCONFIRMED_NS = 1_000_000_000
 
 
-def replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, phase: Phase) -> Decided:
+def replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, phase: PhaseData) -> Decided:
     """Ask for a plan if there is new data, as ordered; without it, or without an answer, the old plan is flown on."""
     controller, context = phase.controller, phase.context
     before_ns = None if draft.plan is None else draft.superseded_after_ns
@@ -80,21 +80,21 @@ def replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, ph
     )
 
 
-def _ask(base: Estimate, target: Array, preview: Preview, phase: Phase) -> SolveOutcome:
+def _ask(base: Estimate, target: Array, preview: Preview, phase: PhaseData) -> SolveOutcome:
     """Ask the solver for a plan."""
     controller = phase.controller
     shape = (controller.horizon, controller.plant.n_u)
     return ask_solver(controller.solver, phase.context.step, base, target, preview, shape, controller.design_id)
 
 
-def _choose_cell_by_plan(draft: Decided, phase: Phase) -> Decided:
+def _choose_cell_by_plan(draft: Decided, phase: PhaseData) -> Decided:
     """Take the cell that waits if the plan in progress keeps it."""
     if draft.cells.pending is None or draft.plan is None or phase.controller.cell_rows is None:
         return draft
     return replace(draft, cells=choose_cell(draft.cells, _locate(draft.plan, phase)))
 
 
-def _locate(plan: Plan, phase: Phase) -> PlannedPath:
+def _locate(plan: Plan, phase: PhaseData) -> PlannedPath:
     """Locate a plan at the steps of the common clock, from this boundary on."""
     controller, rows = phase.controller, phase.controller.cell_rows
     assert rows is not None
@@ -103,7 +103,7 @@ def _locate(plan: Plan, phase: Phase) -> PlannedPath:
 
 
 def _plan_in_cell(
-    draft: Decided, base: Estimate, target: Array | None, preview: Preview, phase: Phase
+    draft: Decided, base: Estimate, target: Array | None, preview: Preview, phase: PhaseData
 ) -> tuple[Decided, SolveOutcome]:
     """Plan inside of the cell that waits, and take it if the plan keeps it; else inside of the one in use.
 
@@ -127,7 +127,7 @@ def _plan_in_cell(
 
 
 def _ask_in_cell(
-    cell: MovingCell, base: Estimate, target: Array | None, preview: Preview, phase: Phase
+    cell: MovingCell, base: Estimate, target: Array | None, preview: Preview, phase: PhaseData
 ) -> SolveOutcome:
     """Ask the solver for a plan inside of a cell, to its goal or to another target."""
     controller, rows = phase.controller, phase.controller.cell_rows
@@ -140,7 +140,7 @@ def _ask_in_cell(
     return _ask(base, target, bounded, phase)
 
 
-def _complete_preview(preview: Preview, base: Estimate, cov: Array, draft: Decided, phase: Phase) -> Preview:
+def _complete_preview(preview: Preview, base: Estimate, cov: Array, draft: Decided, phase: PhaseData) -> Preview:
     """Add data of the estimate and the last input to the question."""
     controller = phase.controller
     # u = u_sent + d: the solver counts what acts on the plant in all
@@ -161,7 +161,7 @@ def _select_axes(vector: Vec3, plant: Plant) -> Array:
     return np.array([vector[AXES.index(axis)] for axis in plant.axes])
 
 
-def _find_input_bounds(bias: Vector, left_hold_ns: int | None, phase: Phase) -> tuple[Array, Array] | None:
+def _find_input_bounds(bias: Vector, left_hold_ns: int | None, phase: PhaseData) -> tuple[Array, Array] | None:
     """Find the least and largest input of a plan, bias included; None where they are those of the design."""
     controller = phase.controller
     bounds = _shift_input_bounds(bias, controller)
@@ -183,7 +183,7 @@ def _shift_input_bounds(bias: Vector, controller: Controller) -> tuple[Array, Ar
     return low + bias, high + bias
 
 
-def _has_new_inertial(plan: Plan | None, phase: Phase) -> bool:
+def _has_new_inertial(plan: Plan | None, phase: PhaseData) -> bool:
     """Whether inertial data have come since the plan was made, and the solver counts the age of its position."""
     view, controller, context = phase.view, phase.controller, phase.context
     if plan is None or (view.age_steps or 0) > controller.late_steps:
