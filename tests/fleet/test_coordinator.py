@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uavctl.fleet.boxes import Boxes, find_gaps
-from uavctl.fleet.cell import CellChoice, MovingCell, PlannedPath, Report, decide_cell
+from uavctl.fleet.cell import NO_CHOICE, CellChoice, MovingCell, PlannedPath, Report, decide_cell
 from uavctl.fleet.coordinator import CellParameters, advance, begin, begin_without_cells, issue, receive
 from uavctl.fleet.voronoi import make_voronoi_cells
 from uavctl.records import Conduct
@@ -213,3 +213,28 @@ def test_a_cell_has_room_for_margins_up_to_a_limit(margin_m: float, room_m: floa
     cell = issue(begin_without_cells(0, [report], PARAMETERS), PARAMETERS).newest[0]
     np.testing.assert_allclose(cell.upper_m - place_m, room_m + PARAMETERS.margin_m, atol=2e-4)
     np.testing.assert_allclose(place_m - cell.lower_m, room_m + PARAMETERS.margin_m, atol=2e-4)
+
+
+def test_vehicles_at_rest_that_stand_nearer_than_their_margins_all_get_cells_and_none_is_told_to_land() -> None:
+    angles = 2.0 * np.pi * np.arange(12) / 12
+    places_m = np.column_stack([2.4 * np.cos(angles), 2.4 * np.sin(angles), np.full(12, -1.2)])
+    margin_m = np.linspace(0.0, 0.5, STAGES)[:, None] * np.ones(3)  # 1.24 m apart, with 0.5 m to keep
+    plans = [PlannedPath(0, np.tile(place_m, (STAGES, 1)), margin_m) for place_m in places_m]
+    reports = [
+        Report(plan, np.zeros(3), 0, 0, Conduct.REST, goal_m=goal_m)
+        for plan, goal_m in zip(plans, -places_m, strict=True)
+    ]
+    state = issue(begin_without_cells(0, reports, PARAMETERS), PARAMETERS)
+    assert all(cell.number == 1 and not cell.land for cell in state.newest)
+    gaps = find_gaps(gather(list(state.newest), 0), gather(list(state.newest), 0), PARAMETERS.distance_m)
+    assert gaps[np.triu_indices(12, 1)].min() >= 1.0 - 1e-9
+    for plan, cell in zip(plans, state.newest, strict=True):
+        assert decide_cell(NO_CHOICE, cell, 0, plan).cell is cell  # its mean is inside, its margins are not
+
+
+def test_a_vehicle_without_a_cell_takes_none_that_its_mean_plan_leaves() -> None:
+    state = issue(begin(0, STARTS_M, GOALS_M, PARAMETERS), PARAMETERS)
+    cell, plan = state.newest[0], state.reports[0].plan
+    beside = PlannedPath(plan.step, plan.mean_m + np.array([0.0, 0.5, 0.0]), plan.margin_m)
+    assert decide_cell(NO_CHOICE, cell, 0, plan).cell is cell
+    assert decide_cell(NO_CHOICE, cell, 0, beside).cell is None

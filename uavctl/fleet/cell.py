@@ -112,7 +112,8 @@ def decide_cell(choice: CellChoice, new: MovingCell, step: int, plan: PlannedPat
     """Take or refuse a new cell at a step, by the plan in progress or by a new one."""
     if not is_open(choice, new):
         return choice
-    allowed_m: Array | float = KEPT_TOLERANCE_M
+    # Without a cell, the mean has to be inside: the first cell of two that stand near to each other may be narrow
+    allowed_m = plan.advance(step).margin_m[1:] + KEPT_TOLERANCE_M
     if choice.cell is not None:
         allowed_m = choice.cell.compute_excess_m(step, plan) + KEPT_TOLERANCE_M
     if (new.compute_excess_m(step, plan) <= allowed_m).all():

@@ -241,7 +241,7 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     landing_places_m = np.where(
         is_told[:, None],
         [cell.goal_m for cell in state.newest],
-        _find_landing_places(state, is_growing | is_blocked, positions_m, parameters),
+        _find_landing_places(state, is_growing, positions_m, parameters),
     )
     guides_m = np.where(must_land[:, None], landing_places_m, guides_m)
     wanted = _extend(plans, guides_m, room_m, parameters)
@@ -329,7 +329,10 @@ def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[
     shift = parameters.shift_stages
     padded_m = np.pad(np.minimum(margin_m, parameters.max_margin_m), ((0, 0), (shift, shift), (0, 0)))
     room_m = sliding_window_view(padded_m, 2 * shift + 1, axis=1).max(axis=3) + parameters.margin_m
-    lower_m, upper_m = mean_m - room_m, mean_m + room_m
+    # Two vehicles at rest may be nearer than their margins for the time without a position: they claim where they are
+    is_at_rest = np.array([report.conduct is Conduct.REST for report in state.reports], dtype=bool)
+    own_m = np.where(is_at_rest[:, None, None], parameters.margin_m, room_m)
+    lower_m, upper_m = mean_m - own_m, mean_m + own_m
     later = np.minimum(np.arange(parameters.stages) + 1, parameters.stages - 1)
     boxes = Boxes(np.minimum(lower_m, lower_m[:, later]), np.maximum(upper_m, upper_m[:, later]))
     return mean_m[:, 0], room_m, boxes.take(state.used.is_empty, boxes.clip_to(state.used))
@@ -365,7 +368,8 @@ def _avoid_obstacles(
         low_m, high_m = box[0] - needed, box[1] + needed
         gap = np.concatenate([low_m - plans.upper_m, plans.lower_m - high_m], axis=2) / np.tile(needed, 2)
         choice = gap.argmax(axis=2)
-        must_land |= (gap.max(axis=2) < 0.0).any(axis=1) & (np.arange(len(must_land)) != i)
+        if is_growing[i]:
+            must_land |= (gap.max(axis=2) < 0.0).any(axis=1) & (np.arange(len(must_land)) != i)
         vehicle, stage = np.nonzero(np.ones(choice.shape, dtype=bool))
         axis, is_below = choice.ravel() % 3, choice.ravel() < 3
         at = vehicle, stage, axis
