@@ -235,7 +235,7 @@ def test_the_vehicle_is_in_the_air_already(tmp_path: Path, run_flight: RunFlight
     rig = EndingRig(tmp_path, airborne=True)
     rig.switch_mode("POSCTL")
     report = run_flight(rig, Cause.TAKE_OFF_NOT_BEGUN, *TAKE_OFF)
-    assert "armed already" in report.ending["sentence"]
+    assert "already armed" in report.ending["sentence"]
 
 
 @pytest.mark.slow

@@ -199,7 +199,7 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert len(times_s) == len(targets) == len({*times_s.tolist()})
     assert {tuple(target[[0, 3, 6]].tolist()) for target in targets} == set(PLACES_M)
     html = render_report(data, summarise(data, wall_s=1.0))
-    (sentence,) = [text for text in describe_flight(data, summarise(data, wall_s=1.0)) if "set out" in text]
+    (sentence,) = [text for text in describe_flight(data, summarise(data, wall_s=1.0)) if "flew towards" in text]
     assert find_numbers(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
     assert sentence.replace("&", "&amp;") in html
     assert compute_position_errors_m(data)[-1] < 0.3

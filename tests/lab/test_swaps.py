@@ -129,7 +129,7 @@ def test_others_keep_away_from_a_vehicle_without_positions(seed: int, tmp_path: 
 
     result = swap.fly(watch)
     assert Conduct.FREE in conducts
-    assert result.exits == 1
+    assert result.exits >= 1  # and one that is told to land beside it
     assert result.collisions == 0
     assert result.closest > 2.0 * CONTACT
 

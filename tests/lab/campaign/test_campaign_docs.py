@@ -11,13 +11,15 @@ from places import ROOT
 
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.controllers import CellSetting, draw_conditions
+from uavctl.lab.campaign.fleets import is_fleet_file, make_fleet_cells, read_fleet_campaign
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.trials import is_trial_file, read_trial
 from uavctl.wiring.controller import build_design
 
 FOLDER = ROOT / "docs" / "campaigns"
 EVERY = sorted(FOLDER.glob("*.toml"))
-FILES = [file for file in EVERY if not is_trial_file(file)]
+FLEETS = [file for file in EVERY if is_fleet_file(file)]
+FILES = [file for file in EVERY if not is_trial_file(file) and file not in FLEETS]
 # (file, controller, link that it believes in): there is no such design, as the file's head says.
 REFUSED = {
     *(("loss", "smpc as printed", f"{loss} %") for loss in range(40, 100, 10)),
@@ -26,11 +28,18 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("file", sorted(set(EVERY) - set(FILES)), ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", sorted(set(EVERY) - set(FILES) - set(FLEETS)), ids=lambda file: file.stem)
 def test_the_flights_of_the_quadrotor_can_be_read_and_are_as_many_as_the_file_says(file: Path) -> None:
     spec, text = read_trial(file)
     cells = math.prod(map(len, (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.controller, spec.link)))
     assert spec.name == file.stem and f"{spec.runs} flights of each of {cells} cells" in text
+
+
+@pytest.mark.parametrize("file", FLEETS, ids=lambda file: file.stem)
+def test_the_campaigns_of_fleets_can_be_read_and_none_of_their_cells_is_refused(file: Path) -> None:
+    spec, _ = read_fleet_campaign(file)
+    assert spec.name == file.stem
+    assert [cell.record.refused for cell in make_fleet_cells(spec) if cell.record.refused] == []
 
 
 @pytest.mark.slow

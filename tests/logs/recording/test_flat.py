@@ -39,6 +39,9 @@ def leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
             held, here = getattr(value, field), f"{name}.{field}" if name else field
             if kind in (Vec3, Vec3 | None) and held is not None:
                 yield from zip((f"{here}_x", f"{here}_y", f"{here}_z"), held, strict=True)
+            elif kind == tuple[Vec3, ...]:
+                for place, vector in enumerate(held):
+                    yield from zip((f"{here}_{place}_x", f"{here}_{place}_y", f"{here}_{place}_z"), vector, strict=True)
             elif field == "design":
                 yield here, msgspec.json.encode(held).decode()
             else:

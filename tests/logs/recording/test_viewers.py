@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # What a flight without trouble never says.
 SILENT = {f"/uavctl/{name}" for name in ("library", "relay", "check", "parameter", "refused", "failure")}
-OF_SEVERAL = {"/sim/fleet", "/sim/collision", "/sim/closest"}  # in a world of several vehicles
+OF_SEVERAL = {"/sim/fleet", "/sim/collision", "/sim/closest", "/uavctl/cell"}  # in a world of several vehicles
 WELL_KNOWN = {"FrameTransforms", "FrameTransform", "PoseInFrame", "PosesInFrame", "Log", "SceneUpdate"}
 # What Rerun makes of a well-known message; of the others it shows the fields.
 DRAWN = {
