@@ -132,6 +132,28 @@ def test_an_older_report_changes_nothing() -> None:
     assert late.reports == state.reports
 
 
+@pytest.mark.parametrize("decided", [1, 2])
+def test_a_vehicle_that_left_its_cell_gets_another_one(decided: int) -> None:
+    """A cell that was on its way at the exit is void: its vehicle never decides about it."""
+    place_m = np.array([0.0, 0.0, -1.5])
+    path = PlannedPath(0, np.tile(place_m, (STAGES, 1)), np.zeros((STAGES, 3)))
+    at_rest = Report(path, np.zeros(3), in_use=0, decided=0, conduct=Conduct.REST)
+    state = issue(begin_without_cells(0, [at_rest], PARAMETERS), PARAMETERS)
+    first = state.newest[0]
+    in_cell = dataclasses.replace(
+        at_rest, plan=path.advance(1), in_use=first.number, decided=first.number, conduct=Conduct.CELL
+    )
+    state = issue(receive(advance(state, 1), {0: in_cell}), PARAMETERS)
+    assert state.newest[0].number == first.number + 1
+    left = dataclasses.replace(at_rest, plan=path.advance(2), decided=decided, conduct=Conduct.FREE, exits=1)
+    state = issue(receive(advance(state, 2), {0: left}), PARAMETERS)
+    again = dataclasses.replace(left, plan=path.advance(3), conduct=Conduct.REST)
+    state = issue(receive(advance(state, 3), {0: again}), PARAMETERS)
+    cell, choice = state.newest[0], CellChoice(None, decided, 1)
+    assert decide_cell(choice, cell, 3, again.plan).cell is cell
+    assert (state.claims.lower_m[0] <= cell.lower_m).all() and (state.claims.upper_m[0] >= cell.upper_m).all()
+
+
 def test_vehicles_too_near_at_the_beginning_are_refused() -> None:
     with pytest.raises(ValueError, match="vehicles 0 and 1"):
         begin(0, STARTS_M[[0, 0]] + np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]), GOALS_M[:2], PARAMETERS)

@@ -96,9 +96,10 @@ class CoordinatorState:
 
     @property
     def is_decided(self) -> Flags:
-        """Whether a vehicle has decided about its newest cell (N,)."""
+        """Whether a vehicle has decided about its newest cell, or its exit has made that cell void (N,)."""
+        rows = zip(self.reports, self.newest, self.exits, strict=True)
         return np.array(
-            [report.decided >= cell.number for report, cell in zip(self.reports, self.newest, strict=True)], dtype=bool
+            [report.decided >= cell.number or exits > cell.exits for report, cell, exits in rows], dtype=bool
         )
 
 
