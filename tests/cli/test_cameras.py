@@ -109,6 +109,11 @@ def _read_positions(daemon: socket.socket) -> list[Vec3]:
         ("loss = 0.3", "signed = true", "south-west: security.key_file: is missing, and radio.signed"),
         ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "udpin://0.0.0.0:14660"', "is that of south-west too"),
         ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "udpin://0.0.0.0:14660/2"', "takes all of"),
+        (
+            'cameras = "udpin://0.0.0.0:14660"',
+            'cameras = "udpin://0.0.0.0:14661/2"',
+            "south-east: cameras: takes all of",
+        ),
         ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "udpin://0.0.0.0:14661/x"', "south-east: cameras: "),
         ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "natnet://10.0.0.5"', "south-east: cameras: "),
         ('cameras = "udpin://0.0.0.0:14661"', 'cameras = "garbage"', "south-east: cameras: "),

@@ -191,6 +191,7 @@ def _find_daemon_problems(config: Config, *, signed: bool) -> Iterator[str]:
 def _find_shared_problems(fleet: Fleet) -> Iterator[str]:
     """Yield what is wrong with the sources, and where two vehicles would have the same body or receiver."""
     name_by_body: dict[tuple[object, str], str] = {}
+    name_by_connection: dict[object, str] = {}  # first vehicle that names a body
     name_by_target: dict[str, str] = {}
     for member in fleet.members:
         target = _find_target_url(member)
@@ -210,6 +211,11 @@ def _find_shared_problems(fleet: Fleet) -> Iterator[str]:
             yield f"{member.name}: cameras: {member.cameras} is that of {other} too; give {remedy} or another source"
         elif body and (connection, "") in name_by_body:
             yield f"{member.name}: cameras: {name_by_body[connection, '']} takes all of {connection}; name its body too"
+        elif not body and connection in name_by_connection:
+            other = name_by_connection[connection]
+            yield f"{member.name}: cameras: takes all of {connection}, where {other} has a body; name its body"
+        if body:
+            name_by_connection.setdefault(connection, member.name)
 
 
 def _find_target_url(member: Member) -> str:
