@@ -30,13 +30,15 @@ from logs.report.fleet import read_fleet as read_flown_fleet
 from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
 from uavctl.cli.ctl import send_request
-from uavctl.cli.fleet import FleetFlight
+from uavctl.cli.fleet import Coordination, FleetEnd, FleetFlight
 from uavctl.cli.fleet_file import Member, compute_gap_m, read_fleet
 from uavctl.cli.fleet_view import choose_ports
 from uavctl.config import load_config
+from uavctl.daemon.cell_exchange import CellExchange
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
 from uavctl.errors import ConfigError, NotReachedError
 from uavctl.records import Truth
+from uavctl.wiring.cells import Coordinator, build_cell_parameters
 from uavctl.wiring.link import build_ages
 
 SPACING_M = 0.5
@@ -276,6 +278,38 @@ def test_positions_in_two_boxes_are_as_far_apart_as_the_reported_gap(
         for state, other_state in ((north, other_north), (east, other_east))
     ]
     assert max(apart_m, 0.0) == pytest.approx(max(nearest))
+
+
+class NotedFlight(FleetFlight):
+    """A flight that only notes the request for its end."""
+
+    is_requested = False
+
+    def request_fallback(self) -> None:
+        self.is_requested = True
+
+
+@pytest.mark.parametrize(
+    ("failure", "problem", "lands_at_once"), [("failed", "", False), ("", "too near", True), ("", "", True)]
+)
+def test_without_a_coordinator_vehicles_have_time_to_rest_before_they_land(
+    failure: str, problem: str, lands_at_once: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The newest reports of a coordinator that failed are old: vehicles at rest in them may move."""
+    flight = NotedFlight(make_member(WEST, EAST), ())
+    config = load_config("room-px4", ["mission.cells=true"])
+    coordinator = Coordinator(build_cell_parameters([config], SPACING_M), 1)
+    exchange = CellExchange(coordinator, (), lambda _: None, pytest.fail)
+    assert exchange.is_at_rest
+    coordination = Coordination(exchange)
+    coordination.failure, exchange.problem = failure, problem
+    end = FleetEnd([flight], coordination)
+    monkeypatch.setattr("uavctl.cli.fleet.REST_S", 1e9)
+    end.update("ordered")
+    assert flight.is_requested is lands_at_once
+    monkeypatch.setattr("uavctl.cli.fleet.REST_S", 0.0)
+    end.update("")
+    assert flight.is_requested
 
 
 @contextmanager

@@ -323,7 +323,9 @@ class FleetEnd:
 
     def _may_land(self, begun_s: float) -> bool:
         coordination = self._coordination
-        if coordination is None or coordination.problem or coordination.exchange.is_at_rest:
+        if coordination is None or coordination.exchange.problem:  # nobody has taken off
+            return True
+        if not coordination.failure and coordination.exchange.is_at_rest:  # after a failure its reports are old
             return True
         return time.monotonic() - begun_s >= REST_S
 
