@@ -11,10 +11,11 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import product
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar, cast
 
 import pytest
 from hypothesis import given
@@ -156,6 +157,7 @@ def test_vehicles_in_cells_share_one_room(tmp_path: Path, capsys: pytest.Capture
             ("vehicle[1]", "mission.trajectory", "waypoints"),
         ),
         (CELLS, ROOM, ("target.position_m=[0.9,-0.8,-2.0]",), ("vehicle[0]", "v0 and v1", "0.40 m apart")),
+        (CELLS, ROOM, ("target.position_m=[1.05,-0.8,-2.0]",), ("vehicle[0]", "0.55 m apart", "0.62 m")),
     ],
 )
 def test_vehicles_that_cannot_fly_in_cells_are_refused_with_key_and_remedy(
@@ -310,6 +312,50 @@ def test_without_a_coordinator_vehicles_have_time_to_rest_before_they_land(
     monkeypatch.setattr("uavctl.cli.fleet.REST_S", 0.0)
     end.update("")
     assert flight.is_requested
+
+
+class TimedFlight:
+    """A daemon that runs until its end is requested."""
+
+    flown: ClassVar[list[TimedFlight]] = []
+
+    def __init__(self, member: Member, options: Sequence[str]) -> None:
+        self.member, self.options, self.exit_code, self.is_requested = member, options, 0, False
+        self.flown.append(self)
+
+    def start(self) -> None: ...
+
+    def join_output(self) -> None: ...
+
+    def is_running(self) -> bool:
+        return not self.is_requested and "--duration" not in self.options
+
+    def request_fallback(self) -> None:
+        self.is_requested = True
+
+
+@pytest.mark.parametrize("head", [HEAD, CELLS], ids=["boxes", "cells"])
+def test_in_cells_the_fleet_ends_all_flights_together_when_the_time_is_over(
+    head: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, held = tmp_path / "fleet.toml", list[bool]()
+    rooms = (WEST, EAST) if head == HEAD else (ROOM, ROOM)
+    goals = [f"target.position_m=[0.5,{east_m},-1.2]" for east_m in (-1.0, 1.0)]
+    entries = [make_entry(f"v{i}", rooms[i], (A, B)[i], "udpin://127.0.0.1:0", goals[i]) for i in (0, 1)]
+    path.write_text(head + "".join(entries))
+    exchange = SimpleNamespace(problem="", is_at_rest=True, hold=lambda: held.append(True))
+    monkeypatch.setattr("uavctl.cli.fleet.FleetFlight", TimedFlight)
+    monkeypatch.setattr("uavctl.cli.fleet._show_status", lambda _: nullcontext({}))
+    monkeypatch.setattr("uavctl.cli.fleet._draw_page", lambda _: None)
+    monkeypatch.setattr(
+        "uavctl.cli.fleet.coordinate", lambda *_: nullcontext(Coordination(cast(CellExchange, exchange)))
+    )
+    TimedFlight.flown.clear()
+    assert run(["fleet", "fly", str(path), "--duration", "0.2", "--out", str(tmp_path / "out")]) == 0
+    in_cells = head == CELLS
+    assert ["--duration" in flight.options for flight in TimedFlight.flown] == [not in_cells] * 2
+    assert [flight.is_requested for flight in TimedFlight.flown] == [in_cells] * 2
+    assert bool(held) is in_cells
 
 
 @contextmanager

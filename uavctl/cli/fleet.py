@@ -131,7 +131,9 @@ def fly(
     check_take_off(arm, takeoff)
     view_port = choose_live_port(live=live, port=live_port)
     fleet = read_fleet(file)
-    options = [*(("--duration", str(duration)) if duration is not None else ())]
+    # In cells one that brakes alone would leave its cell: all end together
+    lasts_alone = duration is not None and fleet.cells is None
+    options = ["--duration", str(duration)] if lasts_alone else []
     options += ["--arm", "--takeoff", str(takeoff)] if takeoff is not None else []
     ports = [] if view_port is None else choose_ports(len(fleet.members))
     flights = [
@@ -149,9 +151,11 @@ def fly(
             coordination = stack.enter_context(coordinate(fleet, fleet.cells, out / COORDINATOR_FILE))
         for flight in flights:
             flight.start()
-        end = FleetEnd(flights, coordination)
+        end, begun_s = FleetEnd(flights, coordination), time.monotonic()
         while any(flight.is_running() for flight in flights):
-            end.update("ordered" if stopped() else _find_failure(flights, health))
+            is_time_over = duration is not None and not lasts_alone and time.monotonic() - begun_s >= duration
+            reason = "ordered" if stopped() else "the time is over" if is_time_over else ""
+            end.update(reason or _find_failure(flights, health))
             time.sleep(POLL_S)
         for flight in flights:
             flight.join_output()
@@ -381,6 +385,8 @@ def coordinate(fleet: Fleet, parameters: CellParameters, path: Path) -> Iterator
         finally:
             done.set()
             thread.join(TABLE_PERIOD_S)
+    if recording.failure:
+        print_message(f"{path}: the recording lacks cycles ({recording.failure}); check the disk")
 
 
 def run_fleet_daemon(rest_s: float) -> None:

@@ -187,11 +187,12 @@ def _find_goal_problems(key: str, first: Member, second: Member, distance_m: flo
     if places[0] is None or places[1] is None:
         return
     offsets_m = [abs(a - b) for a, b in zip(*places, strict=True)][:2]
-    if max(offsets_m) < distance_m:
+    needed_m = distance_m + 2.0 * CellParameters.margin_m
+    if max(offsets_m) < needed_m:
         yield ConfigProblem(
             key,
-            f"the last places of {first.name} and {second.name} are {max(offsets_m):.2f} m apart north or east, "
-            f"{distance_m:g} m is asked for",
+            f"the last places of {first.name} and {second.name} are {max(offsets_m):.2f} m apart north or east; "
+            f"cells need {needed_m:.2f} m",
             "move target.position_m or mission.waypoints of one of them",
         )
 
