@@ -284,9 +284,10 @@ def _gather_claims(
 ) -> tuple[Boxes, Flags]:
     """Gather the claims, and find the vehicles whose path is too near to another one's claim (N,).
 
-    A free vehicle has only the cells that it may still take. One without a cell claims its path, if nobody is there.
+    A cell in use stays a claim until its vehicle reports the exit, also if it is free. A vehicle without a cell claims
+    its path, if nobody is there.
     """
-    claims = state.pending.take(is_free, state.claims)
+    claims = state.claims
     is_path = state.used.is_empty & ~is_free & ~is_silent
     is_blocked = np.zeros(len(is_free), dtype=bool)
     for i in np.flatnonzero(is_path):
