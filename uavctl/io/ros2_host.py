@@ -134,12 +134,12 @@ class Ros2Host:
     def _answer_requests(self) -> None:
         """Read time requests until the daemon has gone."""
         while True:
-            select.select([self._pipe], [], [])
             try:
+                select.select([self._pipe], [], [])
                 data = self._pipe.recv(LARGEST)
             except BlockingIOError:
                 continue
-            except OSError:
+            except (OSError, ValueError):  # the pipe is closed, here or there
                 data = b""
             if not data:
                 self._has_daemon_ended.set()
