@@ -20,7 +20,7 @@ _DECODER = msgspec.json.Decoder(LiveScene | None)
 
 
 class SceneReader:
-    """Reads the scenes of a live view in a thread of its own, and connects anew where it ends.
+    """Reads the scenes of a live view in a thread of its own, and connects again where it ends.
 
     Args:
         port: TCP port of the view; it may open later.

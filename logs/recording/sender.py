@@ -134,7 +134,7 @@ class _SentPosition(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True, eq=False)
-class SentPositions:
+class ServedPositions:
     """Order in which a sender served its vehicles."""
 
     names: tuple[str, ...]  # of all its vehicles, also of those that it never served
@@ -151,7 +151,7 @@ _DECODER = msgspec.json.Decoder(_SentPosition)
 _ERRORS = (McapError, ZstdError, msgspec.MsgspecError, ValueError, OverflowError)
 
 
-def read_sender(path: Path) -> SentPositions:
+def read_sender(path: Path) -> ServedPositions:
     """Read the recording of a sender up to its end, or to its first damage.
 
     Raises:
@@ -177,7 +177,7 @@ def read_sender(path: Path) -> SentPositions:
     if not times_ns:
         raise RecordingError(fault or f"{path}: the sender sent nothing")
     order = np.argsort(np.array(times_ns, dtype=np.int64), kind="stable")
-    return SentPositions(
+    return ServedPositions(
         tuple(numbers), np.array(times_ns, dtype=np.int64)[order], np.array(vehicles, dtype=np.int64)[order], fault
     )
 

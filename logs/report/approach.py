@@ -41,7 +41,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Approach:
+class LeastDistance:
     """Closest approach of two vehicles."""
 
     names: tuple[str, str]
@@ -52,7 +52,7 @@ class Approach:
     is_true: bool  # both positions are a simulator's
 
 
-def find_closest_approach(first: Track, second: Track) -> Approach | None:
+def find_closest_approach(first: Track, second: Track) -> LeastDistance | None:
     """Return the closest approach of two vehicles; None where there is no time at which both positions are known."""
     if min(len(first.at_ns), len(second.at_ns)) < 2:
         return None
@@ -73,7 +73,7 @@ def find_closest_approach(first: Track, second: Track) -> Approach | None:
     index = int(np.linalg.norm(nearest_m, axis=1).argmin())
     north_m, east_m, down_m = nearest_m[index].tolist()
     at_ns = times_ns[:-1][is_known][index] + round(share[index] * np.diff(times_ns)[is_known][index])
-    return Approach(
+    return LeastDistance(
         names=(first.name, second.name),
         at_ns=int(at_ns),
         distance_m=float(np.linalg.norm(nearest_m[index])),

@@ -18,9 +18,9 @@ import numpy as np
 from logs.recording.design_view import DesignView, parse_recorded_config
 from logs.recording.flight import FlightData
 from logs.recording.reader import explain_missing_end, read
-from logs.recording.sender import SentPositions, read_sender
+from logs.recording.sender import ServedPositions, read_sender
 from logs.recording.summary import compute_position_errors_m, find_ending
-from logs.report.approach import Approach, Times, Track, find_closest_approach
+from logs.report.approach import LeastDistance, Times, Track, find_closest_approach
 from logs.report.excursion import select_trusted_estimates
 from uavctl.arrays import SECOND_NS, Array
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
@@ -37,7 +37,7 @@ _NOT_CONTROLLED = (ControlMode.WAIT, ControlMode.STOPPED)
 
 
 @dataclass(frozen=True, eq=False)
-class Encounters:
+class RecordedEncounters:
     """Encounters of simulated vehicles that a recording has; their times are this much later in UTC."""
 
     zero_utc_ns: int
@@ -56,7 +56,7 @@ class Encounters:
 
 
 @dataclass(frozen=True, eq=False)
-class FleetVehicle:
+class RecordedVehicle:
     """Flight of one vehicle; times are UTC [ns]."""
 
     name: str
@@ -72,7 +72,7 @@ class FleetVehicle:
     mean_square_m2: float | None  # of the distance from the target at flown steps; None if none was flown
     ending: Ending
     let_go: tuple[int, str] | None  # time and reason
-    encounters: Encounters
+    encounters: RecordedEncounters
     limits_m: tuple[float, float, float, float]  # south, north, west, east; infinite where open
 
     @property
@@ -110,11 +110,11 @@ class _World:
     """Truth of all vehicles of a simulated world."""
 
     tracks: dict[int, Track]  # by system id
-    encounters: Encounters
+    encounters: RecordedEncounters
 
 
 @dataclass(frozen=True, eq=False)
-class Fleet:
+class FleetRecording:
     """Flight of a fleet.
 
     Attributes:
@@ -124,11 +124,11 @@ class Fleet:
     """
 
     folder: Path
-    vehicles: tuple[FleetVehicle, ...]
+    vehicles: tuple[RecordedVehicle, ...]
     tracks: tuple[Track, ...]
-    approaches: tuple[Approach, ...]
+    approaches: tuple[LeastDistance, ...]
     collisions: tuple[FleetCollision, ...]
-    sent: SentPositions | None
+    sent: ServedPositions | None
     contact_m: float | None  # least distance at which two simulated vehicles touch
     notes: tuple[str, ...]
 
@@ -169,7 +169,7 @@ def is_fleet_folder(path: Path) -> bool:
     return path.is_dir() and ((path / WORLD).exists() or bool(_find_recordings(path)))
 
 
-def read_fleet(folder: Path) -> Fleet:
+def read_fleet(folder: Path) -> FleetRecording:
     """Read the recordings of a fleet's folder.
 
     Raises:
@@ -191,7 +191,7 @@ def read_fleet(folder: Path) -> Fleet:
         raise RecordingError("; ".join(notes) or f"{folder}: holds no recording of a fleet")
     encounters = [vehicle.encounters for vehicle in vehicles] + ([] if world is None else [world.encounters])
     radii_m = sorted(vehicle.radius_m for vehicle in vehicles if vehicle.radius_m is not None)
-    fleet = Fleet(
+    fleet = FleetRecording(
         folder=folder,
         vehicles=vehicles,
         tracks=tuple(sorted(tracks.values(), key=lambda track: _sort_key(track.name))),
@@ -224,7 +224,7 @@ def _read_good_part(path: Path) -> tuple[Entries, str]:
         return entries, str(error)
 
 
-def _read_vehicles(paths: Iterable[Path], notes: list[str]) -> Iterator[FleetVehicle]:
+def _read_vehicles(paths: Iterable[Path], notes: list[str]) -> Iterator[RecordedVehicle]:
     for path in paths:
         entries, fault = _read_good_part(path)
         try:
@@ -237,7 +237,7 @@ def _read_vehicles(paths: Iterable[Path], notes: list[str]) -> Iterator[FleetVeh
         yield vehicle
 
 
-def _make_vehicle(path: Path, flight: FlightData, entries: Entries) -> FleetVehicle:
+def _make_vehicle(path: Path, flight: FlightData, entries: Entries) -> RecordedVehicle:
     zero_ns, design = flight.header.zero_utc_ns or 0, flight.design
     if flight.truths:
         places = [(truth.at_ns, truth.position_m) for truth in flight.truths]
@@ -247,7 +247,7 @@ def _make_vehicle(path: Path, flight: FlightData, entries: Entries) -> FleetVehi
     errors_m = compute_position_errors_m(flight)
     errors_m = errors_m[np.isfinite(errors_m)]
     name, breach = path.parent.name, flight.breach
-    return FleetVehicle(
+    return RecordedVehicle(
         name=name,
         recording=path,
         header=flight.header,
@@ -264,7 +264,7 @@ def _make_vehicle(path: Path, flight: FlightData, entries: Entries) -> FleetVehi
         mean_square_m2=float(np.mean(errors_m**2)) if len(errors_m) else None,
         ending=find_ending(flight),
         let_go=None if breach is None else (zero_ns + breach.at_ns, breach.text),
-        encounters=Encounters.of(entries, zero_ns),
+        encounters=RecordedEncounters.of(entries, zero_ns),
         limits_m=(*_get_limits_m(design, "north"), *_get_limits_m(design, "east")),
     )
 
@@ -291,7 +291,7 @@ def _get_limits_m(design: DesignView, axis: str) -> tuple[float, float]:
     return float(design.state_box.lower[index]), float(design.state_box.upper[index])
 
 
-def _check_same_flight(vehicles: Sequence[FleetVehicle]) -> None:
+def _check_same_flight(vehicles: Sequence[RecordedVehicle]) -> None:
     for first, second in combinations(vehicles, 2):
         overlap_ns = min(first.end_ns, second.end_ns) - max(first.begin_ns, second.begin_ns)
         if overlap_ns < 0 or not _have_one_start(first.header, second.header):
@@ -311,7 +311,7 @@ def _have_one_start(first: Header, second: Header) -> bool:
         return True
 
 
-def _read_world(path: Path, vehicles: Sequence[FleetVehicle], notes: list[str]) -> _World | None:
+def _read_world(path: Path, vehicles: Sequence[RecordedVehicle], notes: list[str]) -> _World | None:
     if not path.exists():
         return None
     entries, fault = _read_good_part(path)
@@ -335,13 +335,13 @@ def _read_world(path: Path, vehicles: Sequence[FleetVehicle], notes: list[str]) 
             places.setdefault(one.system_id, []).append((truth.at_ns, one.position_m))
     tracks = {number: _make_track("", of_one, zero_ns, is_true=True) for number, of_one in places.items()}
     return _World(
-        {number: track for number, track in tracks.items() if len(track.at_ns)}, Encounters.of(entries, zero_ns)
+        {number: track for number, track in tracks.items() if len(track.at_ns)}, RecordedEncounters.of(entries, zero_ns)
     )
 
 
 def _find_approaches(
-    tracks: Sequence[Track], encounters: Sequence[Encounters], names: Mapping[int, str]
-) -> list[Approach]:
+    tracks: Sequence[Track], encounters: Sequence[RecordedEncounters], names: Mapping[int, str]
+) -> list[LeastDistance]:
     """Return the closest approach of each pair; one that the simulator has recorded replaces that of the tracks."""
     recorded = {
         frozenset(names.get(one, "") for one in record.vehicles): (of_one.zero_utc_ns + record.at_ns, record.distance_m)
@@ -355,20 +355,20 @@ def _find_approaches(
         if approach is not None and known is not None and approach.is_true:
             at_ns = np.array([known[0]])
             north_m, east_m, down_m = (second.interpolate(at_ns) - first.interpolate(at_ns))[0].tolist()
-            approach = Approach(approach.names, *known, float(np.hypot(north_m, east_m)), -down_m, is_true=True)
+            approach = LeastDistance(approach.names, *known, float(np.hypot(north_m, east_m)), -down_m, is_true=True)
         if approach is not None:
             approaches.append(approach)
     return sorted(approaches, key=lambda approach: approach.distance_m)
 
 
-def _find_collisions(encounters: Sequence[Encounters], names: Mapping[int, str]) -> Iterator[FleetCollision]:
+def _find_collisions(encounters: Sequence[RecordedEncounters], names: Mapping[int, str]) -> Iterator[FleetCollision]:
     for of_one in encounters:
         for record in of_one.collisions:
             first, second = (names.get(one, f"vehicle-{one}") for one in record.vehicles)
             yield FleetCollision(of_one.zero_utc_ns + record.at_ns, (first, second), record.speed_mps)
 
 
-def _read_sender(path: Path, fleet: Fleet, notes: list[str]) -> SentPositions | None:
+def _read_sender(path: Path, fleet: FleetRecording, notes: list[str]) -> ServedPositions | None:
     """Return what the sender sent during the flight."""
     if not path.exists():
         return None

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from logs.recording.sender import SentPositions
+from logs.recording.sender import ServedPositions
 from logs.report.approach import Times, compute_distances_m
-from logs.report.fleet import Fleet, FleetVehicle
+from logs.report.fleet import FleetRecording, RecordedVehicle
 from logs.report.page import MarkKind
 from logs.report.plots import DASHED, DOTTED, thin_path, thin_samples
 from logs.report.svg import Drawing, colour, draw_strokes, open_canvas
@@ -35,14 +35,14 @@ class LineStyle(NamedTuple):
     dashes: object
 
 
-def choose_style(fleet: Fleet, name: str) -> LineStyle:
+def choose_style(fleet: FleetRecording, name: str) -> LineStyle:
     """Return the style of a vehicle."""
     number = fleet.names.index(name)
     kind, dashes = _LINES[number // len(_ROLES) % len(_LINES)]
     return LineStyle(_ROLES[number % len(_ROLES)], kind, dashes)
 
 
-def draw_paths(fleet: Fleet) -> Iterator[Drawing]:
+def draw_paths(fleet: FleetRecording) -> Iterator[Drawing]:
     """Draw all paths from above, and the least distance of any two vehicles over time."""
     with open_canvas("paths", 3.7) as canvas:
         ax = canvas.axes("From above", "east [m]", "north [m]")
@@ -62,7 +62,7 @@ def draw_paths(fleet: Fleet) -> Iterator[Drawing]:
         yield _draw_least_distance(fleet)
 
 
-def _draw_least_distance(fleet: Fleet) -> Drawing:
+def _draw_least_distance(fleet: FleetRecording) -> Drawing:
     at_ns = np.arange(fleet.begin_ns, fleet.end_ns + 1, _DISTANCE_STEP_NS, dtype=np.int64)
     least_m = np.full(len(at_ns), np.nan)
     for first, second in combinations(fleet.tracks, 2):
@@ -79,7 +79,7 @@ def _draw_least_distance(fleet: Fleet) -> Drawing:
     return Drawing("least-distance", canvas.svg, "Least distance of any two vehicles over time")
 
 
-def draw_ages(fleet: Fleet) -> Iterator[Drawing]:
+def draw_ages(fleet: FleetRecording) -> Iterator[Drawing]:
     """Draw the age of information of each vehicle over time, all to one scale."""
     highest_s = max((float(vehicle.ages_s.max(initial=0.0)) for vehicle in fleet.vehicles), default=0.0)
     for number, vehicle in enumerate(fleet.vehicles):
@@ -87,7 +87,7 @@ def draw_ages(fleet: Fleet) -> Iterator[Drawing]:
             yield _draw_age(fleet, vehicle, f"age-{number}", 1.1 * highest_s)
 
 
-def _draw_age(fleet: Fleet, vehicle: FleetVehicle, key: str, top_s: float) -> Drawing:
+def _draw_age(fleet: FleetRecording, vehicle: RecordedVehicle, key: str, top_s: float) -> Drawing:
     with open_canvas(key, 1.75) as canvas:
         ax = canvas.axes(vehicle.name, "time [s]", "age [s]")
         for begin_ns, end_ns in vehicle.fallbacks_ns:
@@ -102,7 +102,7 @@ def _draw_age(fleet: Fleet, vehicle: FleetVehicle, key: str, top_s: float) -> Dr
     return Drawing(key, canvas.svg, f"Age of information of {vehicle.name} over time")
 
 
-def draw_messages(fleet: Fleet, sent: SentPositions) -> Iterator[Drawing]:
+def draw_messages(fleet: FleetRecording, sent: ServedPositions) -> Iterator[Drawing]:
     """Draw each message as a stroke in its vehicle's row, and the messages a second to each vehicle."""
     yield _draw_raster(fleet, sent)
     begin_s, end_s = (float(fleet.to_seconds(at_ns)) for at_ns in (sent.at_ns[0], sent.at_ns[-1]))
@@ -111,7 +111,7 @@ def draw_messages(fleet: Fleet, sent: SentPositions) -> Iterator[Drawing]:
         yield _draw_rates(fleet, sent, np.linspace(begin_s, end_s, bins + 1))
 
 
-def choose_raster_span(sent: SentPositions) -> tuple[int, int]:
+def choose_raster_span(sent: ServedPositions) -> tuple[int, int]:
     """Return the first and last index of the messages that are drawn: all, or those around the longest wait."""
     count, most = len(sent.at_ns), _STROKES_PER_VEHICLE * len(sent.names)
     if count <= most:
@@ -122,26 +122,26 @@ def choose_raster_span(sent: SentPositions) -> tuple[int, int]:
     return first, first + most - 1
 
 
-class Wait(NamedTuple):
+class LongestWait(NamedTuple):
     """Time of a vehicle without a message."""
 
     wait_ns: int
     begin_ns: int  # UTC
 
 
-def find_longest_wait(sent: SentPositions, name: str) -> Wait:
+def find_longest_wait(sent: ServedPositions, name: str) -> LongestWait:
     """Return the longest time of a vehicle without a message, also before its first and after its last one."""
     times_ns: Times = np.concatenate([sent.at_ns[:1], sent.get_times_ns(name), sent.at_ns[-1:]])
     waits_ns = np.diff(times_ns)
     longest = int(waits_ns.argmax())
-    return Wait(int(waits_ns[longest]), int(times_ns[longest]))
+    return LongestWait(int(waits_ns[longest]), int(times_ns[longest]))
 
 
 def _compute_label_in(names: tuple[str, ...]) -> float:
     return min(_MAX_LABEL_IN, 0.3 + _LETTER_IN * max(map(len, names)))
 
 
-def _draw_raster(fleet: Fleet, sent: SentPositions) -> Drawing:
+def _draw_raster(fleet: FleetRecording, sent: ServedPositions) -> Drawing:
     first, last = choose_raster_span(sent)
     shown_s: Array = fleet.to_seconds(sent.at_ns[first : last + 1])
     rows = sent.vehicles[first : last + 1]
@@ -159,7 +159,7 @@ def _draw_raster(fleet: Fleet, sent: SentPositions) -> Drawing:
     return Drawing("messages", canvas.svg, f"Messages of the sender to {len(sent.names)} vehicles over time")
 
 
-def _draw_rates(fleet: Fleet, sent: SentPositions, edges_s: Array) -> Drawing:
+def _draw_rates(fleet: FleetRecording, sent: ServedPositions, edges_s: Array) -> Drawing:
     with open_canvas("message-rates", _AXIS_IN + _ROW_IN * max(4, len(sent.names))) as canvas:
         ax = canvas.axes("Messages a second", "time [s]", "messages [1/s]")
         for name in sent.names:

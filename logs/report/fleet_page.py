@@ -12,10 +12,10 @@ import numpy as np
 from markupsafe import Markup
 
 from logs.recording.output_files import write_atomically
-from logs.recording.sender import SentPositions
-from logs.report.approach import Approach
+from logs.recording.sender import ServedPositions
+from logs.report.approach import LeastDistance
 from logs.report.findings import Banner, seconds
-from logs.report.fleet import Fleet, FleetVehicle, read_fleet
+from logs.report.fleet import FleetRecording, RecordedVehicle, read_fleet
 from logs.report.fleet_figures import (
     choose_raster_span,
     choose_style,
@@ -71,7 +71,7 @@ class FleetFigures(msgspec.Struct, frozen=True, kw_only=True):
     notes: tuple[str, ...]
 
 
-def compute_vehicle_figures(vehicle: FleetVehicle, sent: SentPositions | None) -> VehicleFigures:
+def compute_vehicle_figures(vehicle: RecordedVehicle, sent: ServedPositions | None) -> VehicleFigures:
     """Compute the figures of a vehicle."""
     ages_s = vehicle.ages_s
     figures = VehicleFigures(
@@ -96,7 +96,7 @@ def compute_vehicle_figures(vehicle: FleetVehicle, sent: SentPositions | None) -
     )
 
 
-def compute_figures(fleet: Fleet, page: Path) -> FleetFigures:
+def compute_figures(fleet: FleetRecording, page: Path) -> FleetFigures:
     """Compute the figures of a fleet's flight."""
     banner = derive_banner(fleet)
     return FleetFigures(
@@ -126,7 +126,7 @@ class _Finding:
     text: str
 
 
-def _find_trouble(fleet: Fleet) -> Iterator[_Finding]:
+def _find_trouble(fleet: FleetRecording) -> Iterator[_Finding]:
     """Yield what went wrong, the gravest first."""
     for collision in fleet.collisions:
         at_s, (first, second) = seconds(fleet.to_seconds(collision.at_ns)), collision.names
@@ -150,7 +150,7 @@ def _find_trouble(fleet: Fleet) -> Iterator[_Finding]:
         yield _Finding(CAUTION, "Incomplete", note)
 
 
-def derive_banner(fleet: Fleet) -> Banner:
+def derive_banner(fleet: FleetRecording) -> Banner:
     """Return the first line of the page: whether anything went wrong, and the lowest distance."""
     findings = list(_find_trouble(fleet))
     distance_text = _describe_closest(fleet)
@@ -162,7 +162,7 @@ def derive_banner(fleet: Fleet) -> Banner:
     return Banner(first.tone, first.word, f"{first.text}; {distance_text}.", reasons)
 
 
-def _describe_closest(fleet: Fleet) -> str:
+def _describe_closest(fleet: FleetRecording) -> str:
     if not fleet.approaches:
         return "no two vehicles whose distance is known"
     closest = fleet.approaches[0]
@@ -171,7 +171,7 @@ def _describe_closest(fleet: Fleet) -> str:
     return f"lowest distance {closest.distance_m:.2f} m, {closest.names[0]} to {closest.names[1]} at {at_s} ({source})"
 
 
-def _show_vehicles(fleet: Fleet) -> Iterator[Part]:
+def _show_vehicles(fleet: FleetRecording) -> Iterator[Part]:
     rows = []
     for vehicle in fleet.vehicles:
         figures = compute_vehicle_figures(vehicle, fleet.sent)
@@ -202,7 +202,7 @@ def _show_vehicles(fleet: Fleet) -> Iterator[Part]:
         yield render_table(columns, rows, frozenset(range(2, len(columns))), kind="dense")
 
 
-def _link_page(vehicle: FleetVehicle) -> str:
+def _link_page(vehicle: RecordedVehicle) -> str:
     """Return the name of a vehicle, as a link to its own page where there is one."""
     page = vehicle.recording.with_suffix(".html")
     if not page.exists():
@@ -214,7 +214,7 @@ def _format(value: float | None, decimals: int = 3) -> str:
     return "–" if value is None else f"{value:.{decimals}f}"
 
 
-def _show_pairs(fleet: Fleet) -> Iterator[Part]:
+def _show_pairs(fleet: FleetRecording) -> Iterator[Part]:
     if fleet.approaches:
         yield _make_pair_table(fleet, fleet.approaches[:_SHOWN_PAIRS])
     rest = fleet.approaches[_SHOWN_PAIRS:]
@@ -222,7 +222,7 @@ def _show_pairs(fleet: Fleet) -> Iterator[Part]:
         yield render_folded(f"{len(rest)} further pairs", _make_pair_table(fleet, rest))
 
 
-def _make_pair_table(fleet: Fleet, approaches: tuple[Approach, ...]) -> Markup:
+def _make_pair_table(fleet: FleetRecording, approaches: tuple[LeastDistance, ...]) -> Markup:
     rows = [
         (
             " – ".join(one.names),
@@ -238,7 +238,7 @@ def _make_pair_table(fleet: Fleet, approaches: tuple[Approach, ...]) -> Markup:
     return render_table(columns, rows, frozenset(range(1, 5)))
 
 
-def _explain_pairs(fleet: Fleet) -> str:
+def _explain_pairs(fleet: FleetRecording) -> str:
     if fleet.is_true:
         until = ", until both have collided" if fleet.collisions else ""
         return f"Least distance of the centres, by the simulator's own positions{until}."
@@ -248,13 +248,13 @@ def _explain_pairs(fleet: Fleet) -> str:
     )
 
 
-def _list_styles(fleet: Fleet) -> Iterator[Mark]:
+def _list_styles(fleet: FleetRecording) -> Iterator[Mark]:
     for name in fleet.names:
         style = choose_style(fleet, name)
         yield Mark(style.kind, style.role, name)
 
 
-def _list_path_marks(fleet: Fleet) -> Iterator[Mark]:
+def _list_path_marks(fleet: FleetRecording) -> Iterator[Mark]:
     yield from _list_styles(fleet)
     yield Mark("ring", "muted", "begin")
     yield Mark("dot", "muted", "end")
@@ -265,7 +265,7 @@ def _list_path_marks(fleet: Fleet) -> Iterator[Mark]:
         yield Mark("line", "limit", "collision")
 
 
-def _show_messages(fleet: Fleet) -> Iterator[Part]:
+def _show_messages(fleet: FleetRecording) -> Iterator[Part]:
     sent = fleet.sent
     if sent is None:
         return
@@ -280,7 +280,7 @@ def _show_messages(fleet: Fleet) -> Iterator[Part]:
     yield from draw_messages(fleet, sent)
 
 
-def _explain_messages(fleet: Fleet) -> str:
+def _explain_messages(fleet: FleetRecording) -> str:
     text = "Each stroke is a position that the sender put on the channel; it does not show whether it arrived."
     if fleet.sent is None:
         return text
@@ -290,14 +290,14 @@ def _explain_messages(fleet: Fleet) -> str:
     return text
 
 
-def _show_recordings(fleet: Fleet) -> Iterator[Part]:
+def _show_recordings(fleet: FleetRecording) -> Iterator[Part]:
     yield render_facts(
         (vehicle.name, f"{vehicle.recording} · {vehicle.header.started_utc} · {vehicle.header.command}")
         for vehicle in fleet.vehicles
     )
 
 
-SECTIONS: tuple[PageSection[Fleet], ...] = (
+SECTIONS: tuple[PageSection[FleetRecording], ...] = (
     PageSection(
         "Vehicles",
         _show_vehicles,
@@ -332,11 +332,11 @@ SECTIONS: tuple[PageSection[Fleet], ...] = (
 )
 
 
-def _reaches_horizon(fleet: Fleet) -> bool:
+def _reaches_horizon(fleet: FleetRecording) -> bool:
     return any(vehicle.horizon_s <= float(vehicle.ages_s.max(initial=0.0)) for vehicle in fleet.vehicles)
 
 
-def render_fleet(fleet: Fleet) -> str:
+def render_fleet(fleet: FleetRecording) -> str:
     """Return the page of a fleet's flight as HTML."""
     count = len(fleet.names)
     started = fleet.vehicles[0].header.started_utc if fleet.vehicles else ""
@@ -345,7 +345,7 @@ def render_fleet(fleet: Fleet) -> str:
     return render_page(title, subtitle, SECTIONS, fleet, derive_banner(fleet))
 
 
-def write_fleet_page(fleet: Fleet, path: Path) -> FleetFigures:
+def write_fleet_page(fleet: FleetRecording, path: Path) -> FleetFigures:
     """Write the page; return its figures.
 
     Raises:

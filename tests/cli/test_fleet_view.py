@@ -19,8 +19,8 @@ from logs.live.process import LiveProcess
 from logs.live.scene import Level, LiveScene, SceneBody, SceneBox, SceneEvent
 from uavctl.cli.fleet_view import (
     MAX_SILENCE_S,
+    ShownState,
     ShownVehicle,
-    VehicleState,
     choose_ports,
     make_fleet_scene,
     show_fleet_page,
@@ -82,8 +82,8 @@ def make_state(
     *,
     silent_s: float = 0.0,
     exit_code: int | None = None,
-) -> VehicleState:
-    return VehicleState(name, scene, silent_s, health, exit_code)
+) -> ShownState:
+    return ShownState(name, scene, silent_s, health, exit_code)
 
 
 def test_each_vehicle_has_its_place_plan_boxes_and_row() -> None:

@@ -32,7 +32,7 @@ PARAMETERS = CellParameters(
 EXIT_SHARE, RETURN_SHARE, FREE_REPORT_SHARE = 0.03, 0.15, 0.1  # of the steps
 
 
-class Vehicle:
+class ExitingVehicle:
     """Flies in cells by random plans, which need not rest; at times it leaves its cell, drifts, and rests again."""
 
     def __init__(self, rng: np.random.Generator, position_m: Array) -> None:
@@ -106,7 +106,7 @@ def test_cells_in_use_are_apart_where_vehicles_leave_them_and_return(loss: float
     places_m = rng.uniform([-1.5, -1.5, -2.0], [1.5, 1.5, -0.5], (vehicles, 3))
     if vehicles > 2:
         places_m[-1] = places_m[0]  # two at one place: neither gets a cell there
-    fleet = [Vehicle(rng, place_m) for place_m in places_m]
+    fleet = [ExitingVehicle(rng, place_m) for place_m in places_m]
     coordinator = Coordinator(PARAMETERS, vehicles)
     reports: list[tuple[int, int, CellReport]] = []  # with the step of arrival, and the vehicle
     cells: list[tuple[int, int, CellMessage]] = []

@@ -88,7 +88,7 @@ def cameras(
 
 
 class _Run:
-    """A sender at work: connections, recording, and what people are told."""
+    """A sender at work: connections, recording, and reports for people."""
 
     def __init__(
         self,
@@ -102,7 +102,7 @@ class _Run:
         self._sources, self._targets = sources, targets
         self._connections = {f"from {number}": source for number, source in enumerate(sources)}
         self._connections |= {f"to {number}": target for number, target in enumerate(targets)}
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._silent: set[int] = set()
         self._reported_ns = 0
 
@@ -143,16 +143,16 @@ class _Run:
         for name, connection in self._connections.items():
             side = "source" if name.startswith("from") else "link"
             if connection.closed:
-                self._tell_once(f"{side} {connection.url} is closed")
+                self._report_once(f"{side} {connection.url} is closed")
             for reason in connection.refused:
                 if reason.startswith(PROCESS_ENDED):
-                    self._tell_once(f"{side} {connection.url}: {reason}")
+                    self._report_once(f"{side} {connection.url}: {reason}")
         if self._recording.failure:
-            self._tell_once(f"the recording lacks positions from now on ({self._recording.failure}); see to the disk")
+            self._report_once(f"the recording lacks positions from now on ({self._recording.failure}); see to the disk")
 
-    def _tell_once(self, text: str) -> None:
-        if text not in self._told:
-            self._told.add(text)
+    def _report_once(self, text: str) -> None:
+        if text not in self._reported:
+            self._reported.add(text)
             print_message(text)
 
 

@@ -89,7 +89,7 @@ def _feed_page(
 
     while not done.wait(PERIOD_S):
         states = [
-            VehicleState(
+            ShownState(
                 vehicle.name, reader.scene, reader.silent_s, vehicle.get_health(), exit_code=vehicle.get_exit_code()
             )
             for vehicle, reader in rows
@@ -98,7 +98,7 @@ def _feed_page(
 
 
 @dataclass(frozen=True)
-class VehicleState:
+class ShownState:
     """All that is known of a vehicle at a moment."""
 
     name: str
@@ -152,7 +152,7 @@ class VehicleState:
         return self.text.partition(":")[0]
 
 
-def make_fleet_scene(title: str, states: Sequence[VehicleState]) -> LiveScene:
+def make_fleet_scene(title: str, states: Sequence[ShownState]) -> LiveScene:
     """Merge the scenes of all vehicles into one, with a row of the table for each."""
     from logs.live.scene import LiveScene, SceneEvent
 
@@ -174,7 +174,7 @@ def make_fleet_scene(title: str, states: Sequence[VehicleState]) -> LiveScene:
     )
 
 
-def _make_headline(states: Sequence[VehicleState], worst: VehicleState) -> str:
+def _make_headline(states: Sequence[ShownState], worst: ShownState) -> str:
     if worst.level in ("bad", "warn"):
         return f"{worst.name}: {worst.text}"
     ages = [(state.scene.age_s, state.name) for state in states if state.scene and state.scene.age_s is not None]
@@ -183,7 +183,7 @@ def _make_headline(states: Sequence[VehicleState], worst: VehicleState) -> str:
     return f"{len(states)} vehicle{'s' if len(states) > 1 else ''}{age_text}"
 
 
-def _make_vehicle(state: VehicleState) -> SceneVehicle:
+def _make_vehicle(state: ShownState) -> SceneVehicle:
     from logs.live.scene import SceneVehicle
 
     scene, health = state.scene, state.health

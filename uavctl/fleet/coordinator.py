@@ -11,7 +11,8 @@ it. Cells and reports may be lost, late, repeated or out of order.
 4. Claims of all vehicles stay apart: a new cell is apart from the new cells and from the claims of all others.
 5. A vehicle that is free is an obstacle that grows. Cells avoid it. A vehicle whose plan may meet it is told to land.
 6. A vehicle without a cell, at rest or in its own climb or landing, claims the path that it reports if that is apart
-   from all other claims; else it is an obstacle there. Once it flies by plans it gets a cell around its path.
+   from all other claims; else it is an obstacle there. At rest by plans it claims its mean path, and gets a cell
+   around that.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class CellParameters:
     silence_s: float = 1.0  # time without a report after which a vehicle counts as an obstacle
 
 
-class Wait(StrEnum):
+class WaitReason(StrEnum):
     """Reason why a vehicle was issued no new cell in a cycle."""
 
     NONE = ""  # it was issued one
@@ -87,7 +88,7 @@ class CoordinatorState:
     reports: tuple[Report, ...]  # newest report of each vehicle
     goals_m: Array  # place that each vehicle is to reach (N, 3)
     exits: tuple[int, ...]  # times that each vehicle has left its cell
-    waits: tuple[Wait, ...] = ()  # of the last cycle, one a vehicle
+    waits: tuple[WaitReason, ...] = ()  # of the last cycle, one a vehicle
 
     @property
     def claims(self) -> Boxes:
@@ -237,10 +238,10 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
         state.goals_m,
         Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m),
     )
-    is_told = np.array([cell.land for cell in state.newest], dtype=bool)
-    # The place stays once it is told: one beside the newest position would lead the vehicle along the floor for good
+    has_landing_cell = np.array([cell.land for cell in state.newest], dtype=bool)
+    # The place stays once it is issued: one beside the newest position would lead the vehicle along the floor for good
     landing_places_m = np.where(
-        is_told[:, None],
+        has_landing_cell[:, None],
         [cell.goal_m for cell in state.newest],
         _find_landing_places(state, is_growing, positions_m, parameters),
     )
@@ -257,15 +258,17 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     # A vehicle that must land has its first such cell at once
     takes_cells = np.array([report.conduct in (Conduct.CELL, Conduct.REST) for report in state.reports], dtype=bool)
     reasons = {
-        Wait.SILENT: is_silent,
-        Wait.NO_PLANS: ~takes_cells,
-        Wait.BLOCKED: is_blocked,
-        Wait.UNDIVIDED: ~bounds.is_divided,
-        Wait.NO_ROOM: cells.is_empty,
-        Wait.UNDECIDED: ~(state.is_decided | (must_land & ~is_told)),
+        WaitReason.SILENT: is_silent,
+        WaitReason.NO_PLANS: ~takes_cells,
+        WaitReason.BLOCKED: is_blocked,
+        WaitReason.UNDIVIDED: ~bounds.is_divided,
+        WaitReason.NO_ROOM: cells.is_empty,
+        WaitReason.UNDECIDED: ~(state.is_decided | (must_land & ~has_landing_cell)),
     }
-    waits = tuple(next((wait for wait, flags in reasons.items() if flags[i]), Wait.NONE) for i in range(len(is_silent)))
-    is_new = np.array([wait is Wait.NONE for wait in waits], dtype=bool)
+    waits = tuple(
+        next((wait for wait, flags in reasons.items() if flags[i]), WaitReason.NONE) for i in range(len(is_silent))
+    )
+    is_new = np.array([wait is WaitReason.NONE for wait in waits], dtype=bool)
     newest = tuple(
         MovingCell(
             cell.number + 1, step, cells.lower_m[i], cells.upper_m[i], guides_m[i], bool(must_land[i]), state.exits[i]

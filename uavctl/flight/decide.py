@@ -211,8 +211,8 @@ def _plan_from(draft: Decided, belief: Belief, phase: PhaseData) -> Decided:
     if controller.mission.land and draft.order is None and is_over(controller.mission, mission, context.boundary_ns):
         landing = request_fallback(draft.fallback, FallbackReason.LAND, context.at_ns)
         return _fall_back(draft, landing, phase, MISSION_OVER)
-    is_told = draft.cells.choice.cell is not None and draft.cells.choice.cell.land
-    if is_told and is_at_landing_place(draft.cells, read_position(base, controller.plant)):
+    has_cell = draft.cells.choice.cell is not None
+    if has_cell and is_at_landing_place(draft.cells, read_position(base, controller.plant)):
         landing = request_fallback(draft.fallback, FallbackReason.LAND, context.at_ns)
         return _fall_back(draft, landing, phase, BESIDE_OBSTACLE)
     if not draft.fault and not supervised.wall.is_none:

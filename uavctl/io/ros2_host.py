@@ -62,7 +62,7 @@ class Ros2Host:
 
         Raises:
             CameraError: the topic cannot be used.
-            TimeoutError: nobody publishes it, or no message comes.
+            TimeoutError: it has no publisher, or no message comes.
         """
         threading.Thread(target=self._answer_requests, name="time requests", daemon=True).start()
         self._subscribe()

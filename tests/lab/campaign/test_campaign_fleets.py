@@ -10,7 +10,7 @@ from uavctl.arrays import SECOND_NS, Array
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
-from uavctl.lab.campaign.fleet_world import FleetRuns, FleetWorld, Vehicle
+from uavctl.lab.campaign.fleet_world import FleetRuns, LinearFleet, TaskVehicle
 from uavctl.lab.campaign.fleets import make_fleet_cells, make_fleet_tasks, read_fleet_campaign, summarise_fleets
 from uavctl.schedule.ages import compute_periodic_tail
 from uavctl.schedule.scheduler import ScheduleName
@@ -38,23 +38,23 @@ def make_radio(schedule: ScheduleName, loss: float, *, reports: bool = True) -> 
     )
 
 
-def make_vehicles(radio: RadioConfig, winds: Iterable[list[float]]) -> list[Vehicle]:
+def make_vehicles(radio: RadioConfig, winds: Iterable[list[float]]) -> list[TaskVehicle]:
     winds = list(winds)
     keys = ["estimator.bias_drift=0", "estimator.bias_max=0", *PROMPT]
     place = ["sim.start_position_m=[0,0,-1.2]", "target.position_m=[0,0,-1.2]"]
     overrides = [*keys, *place, *make_link_overrides(radio, len(winds))]
-    return [Vehicle(load_config("room", [*overrides, f"plant.wind_std_mps2={wind}"])) for wind in winds]
+    return [TaskVehicle(load_config("room", [*overrides, f"plant.wind_std_mps2={wind}"])) for wind in winds]
 
 
 def fly(schedule: ScheduleName, loss: float, winds: Iterable[list[float]], runs: int, steps: int = 200) -> FleetRuns:
     radio = make_radio(schedule, loss)
-    return FleetWorld(make_vehicles(radio, winds), radio).fly(steps, 41, 0, runs)
+    return LinearFleet(make_vehicles(radio, winds), radio).fly(steps, 41, 0, runs)
 
 
 def test_one_message_a_slot_and_the_ages_of_the_periodic_chain() -> None:
     loss, count, steps, runs = 0.3, 4, 200, 20
     radio = make_radio("round-robin", loss)
-    flown = FleetWorld(make_vehicles(radio, [WINDS[1]] * count), radio).fly(steps, 41, 0, runs)
+    flown = LinearFleet(make_vehicles(radio, [WINDS[1]] * count), radio).fly(steps, 41, 0, runs)
     slot_ns = compute_slot_ns(radio)
     assert set(flown.messages) == {float(-(-steps * round(DT_S * SECOND_NS) // slot_ns))}
     # E a = Σ_{n>0} P(a >= n), and a message that is sent at the begin of a step is known at the next one: one more
@@ -70,7 +70,7 @@ def test_equal_tasks_without_losses_cost_the_same_by_every_schedule() -> None:
     flown = []
     for schedule in ("round-robin", "oldest-first", "value"):
         radio = RadioConfig(messages_per_s=20.0, rate_hz=20.0, schedule=schedule, max_wait_s=0.2)
-        flown.append(FleetWorld(make_vehicles(radio, [WINDS[0]] * 3), radio).fly(60, 41, 0, 3))
+        flown.append(LinearFleet(make_vehicles(radio, [WINDS[0]] * 3), radio).fly(60, 41, 0, 3))
     for other in flown[1:]:
         assert np.array_equal(other.vehicle_costs, flown[0].vehicle_costs)
 
@@ -115,7 +115,7 @@ def test_value_is_within_5_percent_of_dynamic_programming_for_two_vehicles() -> 
     first, second = (compute_vehicle_costs(vehicle.config, DT_S)[0] for vehicle in vehicles)
     policy = solve_policy((first, second), 0.0)
     assert 0 < policy.mean() < 1
-    world = FleetWorld(vehicles, radio)
+    world = LinearFleet(vehicles, radio)
     value = world.fly(200, 43, 0, 20)
     best = world.fly(200, 43, 0, 20, lambda _: PolicySchedule(policy))
     assert value.cost.mean() <= 1.05 * best.cost.mean()

@@ -32,7 +32,7 @@ _ROUNDING_NS = 1  # of a delay
 
 
 @dataclass(frozen=True)
-class Vehicle:
+class TaskVehicle:
     """One vehicle: its configuration, and a second target to which it goes and back."""
 
     config: Config
@@ -84,7 +84,7 @@ class _LegDecider:
 class _Pilot:
     """Controllers of vehicles with one task, of all runs side by side, with their true states."""
 
-    def __init__(self, vehicle: Vehicle, numbers: Sequence[int], runs: int, steps: int) -> None:
+    def __init__(self, vehicle: TaskVehicle, numbers: Sequence[int], runs: int, steps: int) -> None:
         config = vehicle.config
         design = build_conditioned(config, for_flight=False)
         problem, plant = build_problem(config), design.plant
@@ -136,7 +136,7 @@ class _Pilot:
 class _Sender:
     """Sender of one run: budget, schedule, and messages and reports on their way."""
 
-    def __init__(self, world: FleetWorld, schedule: Choosing, draws: Array) -> None:
+    def __init__(self, world: LinearFleet, schedule: Choosing, draws: Array) -> None:
         self._world, self._schedule, self._draws = world, schedule, draws
         self._channel = BudgetedChannel(make_budget(world.radio))
         self._under_way: list[tuple[int, int, int]] = []  # step that knows it, vehicle, step of the capture
@@ -178,7 +178,7 @@ class _Sender:
         self._free_ns = at_ns + self._channel.compute_remaining_ns(at_ns)
 
 
-class FleetWorld:
+class LinearFleet:
     """Fleet on one radio.
 
     Attributes:
@@ -189,7 +189,7 @@ class FleetWorld:
         radio: Channel, loss and schedule; with `feedback_s` vehicles report.
     """
 
-    def __init__(self, vehicles: Sequence[Vehicle], radio: RadioConfig) -> None:
+    def __init__(self, vehicles: Sequence[TaskVehicle], radio: RadioConfig) -> None:
         self.vehicles, self.radio = tuple(vehicles), radio
         first = vehicles[0].config
         self.dt_ns = round(first.plant.dt_s * SECOND_NS)
@@ -202,7 +202,7 @@ class FleetWorld:
         master: int,
         first: int,
         runs: int,
-        make_schedule: Callable[[FleetWorld], Choosing] | None = None,
+        make_schedule: Callable[[LinearFleet], Choosing] | None = None,
     ) -> FleetRuns:
         """Fly runs `first` … `first` + `runs` - 1.
 

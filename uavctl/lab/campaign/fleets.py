@@ -20,7 +20,7 @@ from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import MAX_SEED, ConfigProblem, Section, declare
 from uavctl.config.load import parse_toml
 from uavctl.errors import RAISED, ConfigError, DesignError, in_words
-from uavctl.lab.campaign.fleet_world import FleetRuns, FleetWorld, Vehicle, make_report_delay_s
+from uavctl.lab.campaign.fleet_world import FleetRuns, LinearFleet, TaskVehicle, make_report_delay_s
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import CampaignRecord, CellRecord, read_cells, read_document, read_texts
 from uavctl.lab.campaign.spec import (
@@ -108,14 +108,14 @@ class FleetCell(NamedTuple):
 
     record: FleetCellRecord
     radio: RadioConfig
-    vehicles: tuple[Vehicle, ...]
+    vehicles: tuple[TaskVehicle, ...]
 
 
 @dataclass(frozen=True)
 class FleetTask(Work):
     """Task of a campaign of fleets: runs `first` … `first` + `runs` - 1 of a cell."""
 
-    vehicles: tuple[Vehicle, ...]
+    vehicles: tuple[TaskVehicle, ...]
     radio: RadioConfig
     steps: int
     master: int
@@ -123,7 +123,7 @@ class FleetTask(Work):
     def fly(self) -> Columns:
         """Fly the runs; an error ends them all, and their rows have its message."""
         try:
-            flown = FleetWorld(self.vehicles, self.radio).fly(self.steps, self.master, self.first, self.runs)
+            flown = LinearFleet(self.vehicles, self.radio).fly(self.steps, self.master, self.first, self.runs)
         except RAISED as error:  # a crashed run is reported and stops nothing
             return self.make_lost_rows(in_words(error))
         return self._columns("") | {name: getattr(flown, name) for name in _FIGURES}
@@ -155,7 +155,7 @@ def make_fleet_cells(spec: FleetSpec) -> tuple[FleetCell, ...]:
         )
         overrides = make_link_overrides(radio, count)
         tasks = [
-            Vehicle(
+            TaskVehicle(
                 parse(text, CONFIGURATION, (*overrides, *task.set)).config,
                 task.other_target_m,
                 0.0 if task.other_target_m is None else task.leg_s,
