@@ -227,7 +227,7 @@ def test_buffered_voronoi_cells_contain_their_vehicles_and_are_apart() -> None:
     assert find_gaps(boxes, boxes, PARAMETERS.distance_m)[np.triu_indices(4, 1)].min() >= 1.0 - 1e-9
 
 
-@pytest.mark.parametrize(("margin_m", "room_m"), [(0.3, 0.3), (2.0, PARAMETERS.max_margin_m)])
+@pytest.mark.parametrize(("margin_m", "room_m"), [(0.15, 0.15), (2.0, PARAMETERS.max_margin_m)])
 def test_a_cell_has_room_for_margins_up_to_a_limit(margin_m: float, room_m: float) -> None:
     place_m = np.array([0.0, 0.0, -1.5])
     path = PlannedPath(0, np.tile(place_m, (STAGES, 1)), np.full((STAGES, 3), margin_m))
@@ -235,6 +235,24 @@ def test_a_cell_has_room_for_margins_up_to_a_limit(margin_m: float, room_m: floa
     cell = issue(begin_without_cells(0, [report], PARAMETERS), PARAMETERS).newest[0]
     np.testing.assert_allclose(cell.upper_m - place_m, room_m + PARAMETERS.margin_m, atol=2e-4)
     np.testing.assert_allclose(place_m - cell.lower_m, room_m + PARAMETERS.margin_m, atol=2e-4)
+
+
+def test_cells_leave_more_room_for_a_vehicle_that_refuses_them_until_it_takes_one() -> None:
+    place_m = np.array([0.0, 0.0, -1.5])
+    path = PlannedPath(0, np.tile(place_m, (STAGES, 1)), np.full((STAGES, 3), 2.0))
+    report = Report(path, np.zeros(3), in_use=0, decided=0, goal_m=place_m)
+    state = issue(begin_without_cells(0, [report], PARAMETERS), PARAMETERS)
+    state = issue(receive(state, {0: dataclasses.replace(report, in_use=1, decided=1)}), PARAMETERS)
+    rooms_m = []
+    for decided in range(2, 40):  # it keeps the first one
+        state = issue(receive(state, {0: dataclasses.replace(report, in_use=1, decided=decided)}), PARAMETERS)
+        rooms_m.append(float((state.newest[0].upper_m - place_m)[-1, 0]))
+    assert (np.diff(rooms_m) >= 0.0).all()
+    assert rooms_m[-1] > 1.5 * rooms_m[0]
+    assert rooms_m[-1] <= 2.0 * PARAMETERS.max_margin_m + PARAMETERS.margin_m + 2e-4
+    newest = state.newest[0].number
+    state = issue(receive(state, {0: dataclasses.replace(report, in_use=newest, decided=newest)}), PARAMETERS)
+    np.testing.assert_allclose((state.newest[0].upper_m - place_m)[-1, 0], rooms_m[0], atol=2e-4)
 
 
 def test_vehicles_at_rest_that_stand_nearer_than_their_margins_all_get_cells_and_none_is_told_to_land() -> None:

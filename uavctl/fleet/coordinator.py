@@ -28,7 +28,8 @@ from uavctl.arrays import Array, Flags
 from uavctl.fleet.boxes import ROUNDING_M, Bounds, Boxes, divide_pairs, find_gaps, get_axis_distances_m
 from uavctl.fleet.cell import NO_CELL, MovingCell, PlannedPath, Report
 from uavctl.fleet.obstacles import find_reach
-from uavctl.fleet.right_of_way import Ways, choose_guides
+from uavctl.fleet.priority import Progress, choose_places, follow_progress, make_grid
+from uavctl.fleet.right_of_way import ARRIVED_M, Ways, choose_guides
 from uavctl.records import Conduct
 
 START_NUMBER = 0  # number of the cell in which a vehicle begins
@@ -36,6 +37,8 @@ LANDING_WAY_M = 1.2  # way to the side on which a vehicle lands beside an obstac
 LANDING_WALL_M = 0.5  # from the walls to a place to land at: plans keep their margins from walls, and get no nearer
 GRID_M = 1e-4  # sides of cells are multiples of it: short as text, and far below all margins
 GRID_TOLERANCE = 1e-6  # part of it that is rounding
+# A vehicle that refuses cells needs more room around its plan: each refusal in a row gives an eighth more, up to twice
+GROWTH, MAX_REFUSALS = 0.125, 8.0
 MIN_SPEED_MPS, MIN_WAY_M = 0.1, 0.01  # an obstacle that is slower stands; a vehicle that is nearer has no side
 
 
@@ -56,9 +59,9 @@ class CellParameters:
     shift_stages: int = (
         6  # change of the age of a position until a cell is decided about: three lost positions of 20 Hz
     )
-    # Largest margin that a cell leaves room for. Where a cell is wide, rows that do not bind take margins of up to
-    # 4.75 σ, so without it cells widen from one to the next, to 2 m. A plan that needs more refuses the cell
-    max_margin_m: float = 0.4
+    # Largest margin that a cell leaves room for at first. Where a cell is wide, rows that do not bind take margins of
+    # up to 4.75 σ, so without it cells widen from one to the next, to 2 m. A plan that needs more refuses the cell
+    max_margin_m: float = 0.2
     reach_m: float = 1.2  # longest extension beyond the plan: about the way of a plan between two cells
     silence_s: float = 1.0  # time without a report after which a vehicle counts as an obstacle
 
@@ -89,6 +92,7 @@ class CoordinatorState:
     goals_m: Array  # place that each vehicle is to reach (N, 3)
     exits: tuple[int, ...]  # times that each vehicle has left its cell
     waits: tuple[WaitReason, ...] = ()  # of the last cycle, one a vehicle
+    progress: tuple[Progress, ...] = ()  # of each vehicle to its goal
 
     @property
     def claims(self) -> Boxes:
@@ -233,11 +237,9 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     bounds = divide_pairs(claims, plans, parameters.distance_m)
     is_growing = is_free | is_silent
     away, must_land = _avoid_obstacles(state, is_growing, is_blocked, plans, parameters)
-    guides_m = choose_guides(
-        positions_m,
-        state.goals_m,
-        Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m),
-    )
+    takes_cells = np.array([report.conduct in (Conduct.CELL, Conduct.REST) for report in state.reports], dtype=bool)
+    is_led = takes_cells & ~is_silent & ~must_land
+    guides_m, progress = lead(state.progress, positions_m, state.goals_m, is_led, step, parameters)
     has_landing_cell = np.array([cell.land for cell in state.newest], dtype=bool)
     # The place stays once it is issued: one beside the newest position would lead the vehicle along the floor for good
     landing_places_m = np.where(
@@ -256,7 +258,6 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
         np.ceil(lower_m / GRID_M - GRID_TOLERANCE) * GRID_M, np.floor(upper_m / GRID_M + GRID_TOLERANCE) * GRID_M
     )
     # A vehicle that must land has its first such cell at once
-    takes_cells = np.array([report.conduct in (Conduct.CELL, Conduct.REST) for report in state.reports], dtype=bool)
     reasons = {
         WaitReason.SILENT: is_silent,
         WaitReason.NO_PLANS: ~takes_cells,
@@ -279,7 +280,37 @@ def issue(state: CoordinatorState, parameters: CellParameters) -> CoordinatorSta
     )
     previous = tuple(state.newest[i] if is_new[i] else cell for i, cell in enumerate(state.previous))
     pending = state.pending.cover(cells).take(is_new, state.pending)
-    return replace(state, pending=pending, newest=newest, previous=previous, waits=waits)
+    return replace(state, pending=pending, newest=newest, previous=previous, waits=waits, progress=progress)
+
+
+def lead(
+    known: tuple[Progress, ...],
+    positions_m: Array,
+    goals_m: Array,
+    is_led: Flags,
+    step: int,
+    parameters: CellParameters,
+) -> tuple[Array, tuple[Progress, ...]]:
+    """Find the place that each vehicle flies to next (N, 3), and its progress: by priority while one is stuck.
+
+    Args:
+        known: Progress so far; empty at the start.
+        positions_m: (N, 3).
+        goals_m: (N, 3).
+        is_led: Whether a vehicle follows (N,).
+        step: Step now.
+        parameters: Constants of the cells.
+    """
+    level_m, level_goals_m = positions_m[:, :2], goals_m[:, :2]
+    progress = follow_progress(known, level_m, level_goals_m, step, parameters.dt_s, ARRIVED_M)
+    room = parameters.room_lower_m, parameters.room_upper_m
+    guides_m = choose_guides(positions_m, goals_m, Ways(parameters.distance_m, parameters.margin_m, *room))
+    if any(one.is_stuck for one in progress):
+        pitch_m = parameters.distance_m + 2.0 * (parameters.margin_m + parameters.max_margin_m)
+        waits = step - np.array([one.step for one in progress])
+        places_m = choose_places(level_m, level_goals_m, waits, is_led, make_grid(*room, pitch_m))
+        guides_m[is_led, :2] = places_m[is_led]
+    return guides_m, progress
 
 
 def _gather_claims(
@@ -331,8 +362,9 @@ def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[
     """
     plans = [report.plan.advance(state.step) for report in state.reports]
     mean_m, margin_m = np.array([plan.mean_m for plan in plans]), np.array([plan.margin_m for plan in plans])
+    most_m = parameters.max_margin_m * (1.0 + GROWTH * _count_refusals(state))[:, None, None]
     shift = parameters.shift_stages
-    padded_m = np.pad(np.minimum(margin_m, parameters.max_margin_m), ((0, 0), (shift, shift), (0, 0)))
+    padded_m = np.pad(np.minimum(margin_m, most_m), ((0, 0), (shift, shift), (0, 0)))
     room_m = sliding_window_view(padded_m, 2 * shift + 1, axis=1).max(axis=3) + parameters.margin_m
     # Two vehicles at rest may be nearer than their margins for the time without a position: they claim where they are
     is_at_rest = np.array([report.conduct is Conduct.REST for report in state.reports], dtype=bool)
@@ -341,6 +373,12 @@ def _gather_plans(state: CoordinatorState, parameters: CellParameters) -> tuple[
     later = np.minimum(np.arange(parameters.stages) + 1, parameters.stages - 1)
     boxes = Boxes(np.minimum(lower_m, lower_m[:, later]), np.maximum(upper_m, upper_m[:, later]))
     return mean_m[:, 0], room_m, boxes.take(state.used.is_empty, boxes.clip_to(state.used))
+
+
+def _count_refusals(state: CoordinatorState) -> Array:
+    """Count the cells that each vehicle has refused in a row but for the first, up to a limit (N,)."""
+    rows = [report.decided - report.in_use - 1 if report.in_use != NO_CELL else 0 for report in state.reports]
+    return np.clip(np.array(rows, dtype=np.float64), 0.0, MAX_REFUSALS)
 
 
 def _extend(plans: Boxes, guides_m: Array, room_m: Array, parameters: CellParameters) -> Boxes:

@@ -23,8 +23,8 @@ from uavctl.arrays import SECOND_NS, Array
 from uavctl.config import load_config
 from uavctl.fleet.boxes import DOWNWASH
 from uavctl.fleet.cell import Report, format_cell, parse_report
-from uavctl.fleet.coordinator import CellParameters
-from uavctl.fleet.right_of_way import Ways, choose_guides
+from uavctl.fleet.coordinator import CellParameters, lead
+from uavctl.fleet.priority import Progress
 from uavctl.fleet.voronoi import make_voronoi_cells
 from uavctl.lab.lockstep import LockstepFleet, RecordedSender
 from uavctl.records import CellMessage, CellReport
@@ -65,7 +65,7 @@ class SwapCase:
     loss: float = 0.3  # of positions, cells and reports
     method: Method = "cells"
     distance_m: float = 0.5  # that pairs keep
-    limit_s: float = 60.0
+    limit_s: float = 120.0
     cells_end_s: float = math.inf  # when the coordinator stops
     overrides: tuple[str, ...] = ()  # of all vehicles
     faults: tuple[tuple[int, str], ...] = ()  # override of one vehicle, by its number
@@ -121,6 +121,7 @@ class CellTraffic:
         self._reports: list[tuple[int, int, CellReport]] = []  # with the time of arrival, and the vehicle
         self._cells: list[tuple[int, int, CellMessage]] = []
         self._newest: dict[int, Report] = {}
+        self._progress: tuple[Progress, ...] = ()
 
     def exchange(self, at_ns: int) -> None:
         """Deliver what has arrived by a time; where a cycle begins, take reports and send cells."""
@@ -150,9 +151,10 @@ class CellTraffic:
         parameters, newest = self._parameters, [self._newest[number] for number in range(self._case.vehicles)]
         positions_m = np.array([report.plan.mean_m[0] for report in newest])
         goals_m = np.array([report.goal_m for report in newest])
-        ways = Ways(parameters.distance_m, parameters.margin_m, parameters.room_lower_m, parameters.room_upper_m)
         step = at_ns // round(parameters.dt_s * SECOND_NS)
-        cells = make_voronoi_cells(positions_m, choose_guides(positions_m, goals_m, ways), step + 1, step, parameters)
+        is_led = np.ones(len(newest), dtype=bool)
+        guides_m, self._progress = lead(self._progress, positions_m, goals_m, is_led, step, parameters)
+        cells = make_voronoi_cells(positions_m, guides_m, step + 1, step, parameters)
         return {number: format_cell(cell) for number, cell in enumerate(cells)}
 
     def _send(self, queue: list[tuple[int, int, Message]], at_ns: int, number: int, message: Message) -> None:
