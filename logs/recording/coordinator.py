@@ -1,51 +1,33 @@
-"""Recording of the coordinator of the cells: one MCAP file with a JSON message for each cycle."""
+"""Recording of the coordinator of the cells: in each cycle the reports that it took up, its cells, and its state."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import msgspec
-from mcap.writer import Writer
+import numpy as np
 
-from uavctl.errors import RecordingError
+from logs.recording.recorder import Recorder
+from logs.recording.topics import COORDINATOR_HEADER, CYCLE, ISSUED, TAKEN
+from uavctl.fleet.cell import format_cell, format_report
 from uavctl.fleet.coordinator import CellParameters, CoordinatorState, find_nearest_claims
-from uavctl.records import Conduct, Vec3
-
-TOPIC = "/uavctl/coordinator"
-CHUNK_BYTES = 65_536  # a killed process loses the messages of the last chunk, some seconds
-
-
-class VehicleCycle(msgspec.Struct, frozen=True, kw_only=True):
-    """State of a vehicle in a cycle."""
-
-    report_age_s: float  # since the step of its newest report
-    conduct: Conduct
-    position_m: Vec3  # as reported
-    goal_m: Vec3  # place that its mission, or the operator, wants it at
-    guide_m: Vec3  # place to which its newest cell leads it: its goal, or a way around others
-    in_use: int  # number of its cell; 0 without one
-    decided: int  # number of the newest cell that it took or refused
-    newest: int  # number of its newest cell
-    wait: str  # why it was issued none; empty if it was
-    land: bool  # whether it is told to land
-    nearest: str  # vehicle whose claim is nearest to its own; empty without one
-    gap: float | None  # of these claims over the distance to keep, the least of all stages; apart: at least 1
+from uavctl.fleet_records import CoordinatorCycle, CoordinatorHeader, IssuedCell, TakenReport, VehicleCycle
+from uavctl.records import Record
+from uavctl.wiring.cells import Coordinator
 
 
-class CycleRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A cycle of the coordinator."""
-
-    at_ns: int  # monotonic time
-    step: int
-    vehicles: dict[str, VehicleCycle]
+def format_parameters(parameters: CellParameters) -> dict[str, object]:
+    """Return the constants of a coordinator as plain values."""
+    values = {field.name: getattr(parameters, field.name) for field in fields(parameters)}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
-def make_cycle_record(
+def make_cycle(
     at_ns: int, state: CoordinatorState, parameters: CellParameters, names: Sequence[str]
-) -> CycleRecord:
+) -> CoordinatorCycle:
     """Make the record of a cycle."""
     vehicles = {}
     for i, (near, gap) in enumerate(find_nearest_claims(state, parameters)):
@@ -64,35 +46,42 @@ def make_cycle_record(
             nearest="" if near == i else names[near],
             gap=None if near == i else round(gap, 4),
         )
-    return CycleRecord(at_ns=at_ns, step=state.step, vehicles=vehicles)
+    return CoordinatorCycle(at_ns=at_ns, step=state.step, vehicles=vehicles)
+
+
+def list_cycle_records(at_ns: int, coordinator: Coordinator, names: Sequence[str]) -> list[tuple[str, Record]]:
+    """Return topic and record of all that the last cycle decided: its cells, then its state; nothing before it."""
+    state = coordinator.state
+    if state is None:
+        return []
+    records: list[tuple[str, Record]] = [
+        (ISSUED, IssuedCell(vehicle=names[i], cell=format_cell(state.newest[i])))
+        for i, wait in enumerate(state.waits)
+        if not wait
+    ]
+    return [*records, (CYCLE, make_cycle(at_ns, state, coordinator.parameters, names))]
 
 
 class CoordinatorRecording:
-    """Writes the cycles of a coordinator; `log_time` is UTC.
-
-    Attributes:
-        failure: Why nothing is written any more; empty as long as it is.
+    """Records the cycles of a coordinator from a thread of its own; a disk that fails or hangs delays none.
 
     Args:
+        names: Of the vehicles.
+        start_ns: Monotonic time of the start.
         zero_utc_ns: UTC of time 0 of the monotonic clock [ns since 1970].
 
     Raises:
-        RecordingError: There is such a file, or it cannot be made.
+        RecordingError: There is such a file, or its folder cannot be made.
     """
 
-    def __init__(self, path: Path, zero_utc_ns: int) -> None:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("xb")
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another folder") from error
-        self._zero_utc_ns = zero_utc_ns
-        self.failure = ""
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
-        self._writer.start(profile="", library="uavctl")
-        schema = msgspec.json.encode(msgspec.json.schema(CycleRecord))
-        number = self._writer.register_schema("uavctl.CycleRecord", "jsonschema", schema)
-        self._channel = self._writer.register_channel(TOPIC, "json", number)
+    def __init__(
+        self, path: Path, names: Sequence[str], parameters: CellParameters, *, start_ns: int, zero_utc_ns: int
+    ) -> None:
+        self._names, self._recorder = names, Recorder(path)
+        header = CoordinatorHeader(
+            zero_utc_ns=zero_utc_ns, names=tuple(names), parameters=format_parameters(parameters)
+        )
+        self._recorder.put(COORDINATOR_HEADER, start_ns, header)
 
     def __enter__(self) -> Self:
         return self
@@ -100,19 +89,17 @@ class CoordinatorRecording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        try:
-            if not self.failure:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
-        except OSError as write_error:
-            self.failure = write_error.strerror or "write error"
+        self._recorder.close()
 
-    def add(self, record: CycleRecord) -> None:
-        """Add a cycle; a write error ends the recording alone."""
-        if self.failure:
-            return
-        time_ns = self._zero_utc_ns + record.at_ns
-        try:
-            self._writer.add_message(self._channel, time_ns, msgspec.json.encode(record), time_ns)
-        except OSError as error:
-            self.failure = error.strerror or "write error"
+    @property
+    def failure(self) -> str:
+        """What is wrong; empty if the disk takes all cycles."""
+        return self._recorder.status().problem
+
+    def add(self, at_ns: int, coordinator: Coordinator) -> None:
+        """Add the last cycle of a coordinator."""
+        for number, report in sorted(coordinator.taken.items()):
+            taken = TakenReport(vehicle=self._names[number], report=format_report(report))
+            self._recorder.put(TAKEN, at_ns, taken)
+        for topic, record in list_cycle_records(at_ns, coordinator, self._names):
+            self._recorder.put(topic, at_ns, record)

@@ -68,6 +68,8 @@ class ChunkReader:
         self._budget = budget
         self._schemas: dict[int, Schema] = {}
         self._definitions: dict[bytes, tuple[int, Definition, int]] = {}
+        # Each of our chunks names its channels; those of other writers may lie in an earlier one.
+        self._channels: dict[int, tuple[Definition, int]] = {}
 
     def read_messages(
         self, content: bytes, offset: int, order: ReadingOrder | None = None
@@ -88,14 +90,14 @@ class ChunkReader:
             raise _BadRecordError("is no chunk of a recording, though its checksum is right") from error
 
     def _read_messages(self, content: bytes, offset: int, order: ReadingOrder | None) -> Iterator[RecordedMessage]:
-        channels: dict[int, tuple[Definition, int]] = {}
+        channels = self._channels
         at = 0
         size = len(content)
         take_record = self._budget.take_record
         while at < size:
             take_record()
             if content[at] != _IS_MESSAGE:
-                at = self._add_definition(content, at, channels)
+                at = self._add_definition(content, at)
                 continue
             _, length, channel, sequence, at_ns, _ = MESSAGE.unpack_from(content, at)
             begin, at = at + MESSAGE.size, at + _RECORD.size + length
@@ -111,13 +113,13 @@ class ChunkReader:
             data = content[begin:at]
             yield RecordedMessage(definition, sequence, at_ns - zero_utc_ns, data, offset, zero_utc_ns=zero_utc_ns)
 
-    def _add_definition(self, content: bytes, at: int, channels: dict[int, tuple[Definition, int]]) -> int:
+    def _add_definition(self, content: bytes, at: int) -> int:
         """Add a channel or schema; return the offset after it."""
         opcode, length = _RECORD.unpack_from(content, at)
         at += _RECORD.size
         if opcode == Opcode.CHANNEL:
             channel, definition, zero_utc_ns = self._read_channel(content[at : at + length])
-            channels[channel] = definition, zero_utc_ns
+            self._channels[channel] = definition, zero_utc_ns
         elif opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
             if self._schemas.get(schema.id) != schema:

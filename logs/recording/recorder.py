@@ -24,6 +24,7 @@ from logs.recording.segment import Rotation
 from logs.recording.topics import HEADER, RECORDER, encode, encode_message
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
+from uavctl.fleet_records import CoordinatorHeader, SenderHeader
 from uavctl.records import Datagram, Header, Record
 
 Watcher = Callable[[str, int, bytes], None]
@@ -104,6 +105,11 @@ class RecorderStatus(msgspec.Struct, frozen=True, kw_only=True):
     warning: str = ""  # the disk gets low
     unwritten_s: float = 0.0  # since the last completed write, while something waits for the disk [s]
     unseen: int = 0  # records of which no messages for viewers could be made; they are in the recording
+
+    @property
+    def problem(self) -> str:
+        """What is wrong, in words; empty if nothing is."""
+        return "" if self.ok else self.reason or f"{self.dropped + self.refused + self.waiting} records lost"
 
 
 class WriteQueue:
@@ -253,7 +259,7 @@ class WriteQueue:
         if not waits or not files.may_begin:
             return False
         head = self.queue[0][2] if self.queue else None
-        if isinstance(head, Header):  # it comes first, and tells the time of all that follows
+        if isinstance(head, HEADERS):  # it comes first, and tells the time of all that follows
             files.zero_utc_ns = head.zero_utc_ns or 0
         files.begin(self._write_note)
         return True
@@ -324,6 +330,7 @@ class WriteQueue:
             self._files.fail(error)
 
 
+HEADERS = Header, SenderHeader, CoordinatorHeader
 POLL_S = 0.02
 # Records of a round. Each takes some 30 us with its messages for viewers, so that the interpreter, which a tick waits
 # for, is free again after 2 ms. A round every POLL_S makes 3200 records a second, several times what a flight has.

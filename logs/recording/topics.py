@@ -24,6 +24,17 @@ from logs.recording.earlier import complete_record
 from logs.recording.notes import RecorderNote
 from uavctl.arrays import Array
 from uavctl.errors import RecordingError
+from uavctl.fleet_records import (
+    CoordinatorCycle,
+    CoordinatorHeader,
+    IssuedCell,
+    OfferedPosition,
+    ReportedPosition,
+    ScheduleWeights,
+    SenderHeader,
+    SentPosition,
+    TakenReport,
+)
 from uavctl.records import (
     CellDecision,
     Checked,
@@ -59,6 +70,10 @@ LIBRARY = "/uavctl/library"
 PARAMETER = "/uavctl/parameter"
 ENDED = "/uavctl/end"
 RECORDER = "/uavctl/recorder"
+SENDER_HEADER, COORDINATOR_HEADER = "/uavctl/sender_header", "/uavctl/coordinator_header"
+OFFERED, REPORTED = "/uavctl/sender_position", "/uavctl/sender_report"
+WEIGHTS, SENT = "/uavctl/sender_weights", "/uavctl/sender"
+TAKEN, ISSUED, CYCLE = "/uavctl/coordinator_report", "/uavctl/coordinator_cell", "/uavctl/coordinator"
 
 
 @dataclass(frozen=True)
@@ -121,6 +136,15 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/sim/fleet", FleetTruth, "true state of all vehicles in one world, in `world.mcap`"),
     Topic("/sim/collision", Collision, "collision of two simulated vehicles"),
     Topic("/sim/closest", ClosestApproach, "closest approach of each pair, at the end"),
+    Topic(SENDER_HEADER, SenderHeader, "constants of the sender; first message of `sender.mcap`"),
+    Topic(OFFERED, OfferedPosition, "position that came to the sender; replay starts from here"),
+    Topic(REPORTED, ReportedPosition, "report that came to the sender; an input of its replay, too"),
+    Topic(WEIGHTS, ScheduleWeights, "weights of the vehicles, at each update"),
+    Topic(SENT, SentPosition, "position that the sender sent"),
+    Topic(COORDINATOR_HEADER, CoordinatorHeader, "constants of the coordinator; first message of `coordinator.mcap`"),
+    Topic(TAKEN, TakenReport, "report to the coordinator; replay starts from here"),
+    Topic(ISSUED, IssuedCell, "cell of the coordinator"),
+    Topic(CYCLE, CoordinatorCycle, "cycle of the coordinator, after its reports and cells"),
     Topic(RECORDER, RecorderNote, "state of the recorder: segments, drops, failed writes"),
 )
 _BY_NAME = {topic.name: topic for topic in TOPICS}

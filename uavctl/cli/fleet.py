@@ -28,7 +28,7 @@ from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
-from logs.recording.coordinator import CoordinatorRecording, make_cycle_record
+from logs.recording.coordinator import CoordinatorRecording
 from uavctl.arrays import SECOND_NS
 from uavctl.cell_report import COLUMN_M
 from uavctl.cli import main
@@ -41,7 +41,7 @@ from uavctl.cli.health_lines import hide_health_lines
 from uavctl.cli.output import make_message_console, make_pair_table, make_table, print_message
 from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.usage import format_example
-from uavctl.clock import read_zero_utc_ns
+from uavctl.clock import monotonic_ns, read_zero_utc_ns
 from uavctl.daemon.cell_exchange import CellExchange, ExchangedVehicle, run_exchange
 from uavctl.daemon.control_socket import ControlRequest, find_control_folder, make_socket_path
 from uavctl.daemon.health import Health
@@ -368,15 +368,13 @@ def coordinate(fleet: Fleet, parameters: CellParameters, path: Path) -> Iterator
     folder, coordinator = find_control_folder(None), Coordinator(parameters, len(fleet.members))
     names = [member.name for member in fleet.members]
 
-    with CoordinatorRecording(path, read_zero_utc_ns()) as recording:
-
-        def record(at_ns: int) -> None:
-            if coordinator.state is not None:
-                recording.add(make_cycle_record(at_ns, coordinator.state, parameters, names))
-
+    with CoordinatorRecording(
+        path, names, parameters, start_ns=monotonic_ns(), zero_utc_ns=read_zero_utc_ns()
+    ) as recording:
         sockets = [make_socket_path(folder, member.daemon) for member in fleet.members]
         vehicles = [ExchangedVehicle(name, path) for name, path in zip(names, sockets, strict=True)]
-        coordination = Coordination(CellExchange(coordinator, vehicles, record, print_message))
+        exchange = CellExchange(coordinator, vehicles, lambda at_ns: recording.add(at_ns, coordinator), print_message)
+        coordination = Coordination(exchange)
         done = threading.Event()
         thread = threading.Thread(target=coordination.run, args=(done.wait,), name="cells", daemon=True)
         thread.start()

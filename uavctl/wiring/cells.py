@@ -132,6 +132,9 @@ def build_cell_parameters(configs: Sequence[Config], distance_m: float) -> CellP
 class Coordinator:
     """Coordinator of the cells of several vehicles: reports in, cells out; time is an argument.
 
+    Attributes:
+        taken: Reports that the last cycle took up, by the number of the vehicle.
+
     Args:
         parameters: Its constants.
         vehicles: Number of vehicles.
@@ -139,6 +142,7 @@ class Coordinator:
 
     def __init__(self, parameters: CellParameters, vehicles: int) -> None:
         self._parameters, self._vehicles = parameters, vehicles
+        self.taken: Mapping[int, Report] = {}
         self._newest: dict[int, Report] = {}  # newest report of each vehicle that has sent one
         self._received: dict[int, Report] = {}  # since the last cycle
         self._state: CoordinatorState | None = None
@@ -193,15 +197,15 @@ class Coordinator:
         """
         for number, message in messages.items():
             self.receive(number, message)
-        reports, self._received = self._received, {}
         step = at_ns // round(self._parameters.dt_s * SECOND_NS)
         if self._state is None:
             if not self.has_all_reports:
                 return {}
             ordered = [self._newest[number] for number in range(self._vehicles)]
             self._state = begin_without_cells(step, ordered, self._parameters)
+        self.taken, self._received = self._received, {}
         state = advance(self._state, max(step, self._state.step))
-        self._state = state = issue(receive(state, reports), self._parameters)
+        self._state = state = issue(receive(state, self.taken), self._parameters)
         open_cells = zip(state.newest, state.is_decided, strict=True)
         return {number: format_cell(cell) for number, (cell, is_decided) in enumerate(open_cells) if not is_decided}
 

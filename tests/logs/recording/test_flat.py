@@ -42,7 +42,7 @@ def leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
             elif kind == tuple[Vec3, ...]:
                 for place, vector in enumerate(held):
                     yield from zip((f"{here}_{place}_x", f"{here}_{place}_y", f"{here}_{place}_z"), vector, strict=True)
-            elif field == "design":
+            elif kind == dict[str, object]:
                 yield here, msgspec.json.encode(held).decode()
             else:
                 yield from leaves(held, here)

@@ -7,6 +7,7 @@ import pytest
 
 from logs.recording.derived_topics import VIEWS
 from logs.recording.topics import TOPICS, get_definition, get_record_type, is_view, parse_raw_topic
+from uavctl import fleet_records
 from uavctl import records as data
 from uavctl.records import Datagram, Decision, Record, raw_topic
 
@@ -26,10 +27,12 @@ def test_every_recorded_type_has_one_topic() -> None:
         "VehicleTruth",
         "CellMessage",
         "CellReport",
+        "ScheduledVehicle",
+        "VehicleCycle",
     }
     types = {
         name
-        for name, kind in vars(data).items()
+        for name, kind in {**vars(data), **vars(fleet_records)}.items()
         if isinstance(kind, type) and issubclass(kind, Record) and name not in inside
     }
     assert {topic.record.__name__ for topic in TOPICS} == types | {"RecorderNote"}
