@@ -36,6 +36,8 @@ class SenderHeader(Record, frozen=True, kw_only=True):
     spacing_m: float  # smallest distance of two vehicles
     costs: tuple[tuple[float, ...], ...]  # of an age of 0, 1 … slots, one row a kind of vehicle
     vehicles: tuple[ScheduledVehicle, ...]
+    versions: dict[str, str]  # of code, libraries and arithmetic, which decide the last bits
+    cpu: str
 
 
 class OfferedPosition(Record, frozen=True, kw_only=True):
@@ -75,6 +77,8 @@ class CoordinatorHeader(Record, frozen=True, kw_only=True):
     zero_utc_ns: int  # UTC of time 0 of the recording's clock [ns since 1970]
     names: tuple[str, ...]  # of the vehicles
     parameters: dict[str, object]  # `uavctl.fleet.coordinator.CellParameters`
+    versions: dict[str, str]  # of code, libraries and arithmetic, which decide the last bits
+    cpu: str
 
 
 class TakenReport(Record, frozen=True, kw_only=True):

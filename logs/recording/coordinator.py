@@ -17,6 +17,7 @@ from uavctl.fleet.coordinator import CellParameters, CoordinatorState, find_near
 from uavctl.fleet_records import CoordinatorCycle, CoordinatorHeader, IssuedCell, TakenReport, VehicleCycle
 from uavctl.records import Record
 from uavctl.wiring.cells import Coordinator
+from uavctl.wiring.controller import collect_versions, read_cpu_model
 
 
 def format_parameters(parameters: CellParameters) -> dict[str, object]:
@@ -79,7 +80,11 @@ class CoordinatorRecording:
     ) -> None:
         self._names, self._recorder = names, Recorder(path)
         header = CoordinatorHeader(
-            zero_utc_ns=zero_utc_ns, names=tuple(names), parameters=format_parameters(parameters)
+            zero_utc_ns=zero_utc_ns,
+            names=tuple(names),
+            parameters=format_parameters(parameters),
+            versions=collect_versions(""),
+            cpu=read_cpu_model(),
         )
         self._recorder.put(COORDINATOR_HEADER, start_ns, header)
 

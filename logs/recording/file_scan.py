@@ -350,7 +350,7 @@ def _scan_records(path: Path, data: Buffer, order: ReadingOrder | None) -> Itera
                 yield _read_attachment(data, at, length, budget)
             if opcode == Opcode.DATA_END:
                 stored = _DATA_END.unpack_from(data, at)[2]
-                if not damaged and stored != _compute_crc(data, at):
+                if not damaged and stored and stored != _compute_crc(data, at):  # 0: not computed
                     yield Damage(path, at, 0, "every chunk is whole, but something between them is damaged")
                 finished = _is_summary_right(data, at + length)
                 if not finished:

@@ -6,6 +6,7 @@ Every record that comes out must be the recorded one, bit for bit. What differs 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,30 @@ import msgspec
 import numpy as np
 
 from logs.recording.coordinator import list_cycle_records
-from logs.recording.reader import explain_missing_end, read, read_last_note
+from logs.recording.file_scan import RecordedMessage
+from logs.recording.reader import explain_missing_end, read, read_last_note, scan_recording
 from logs.recording.replay import find_different_leaves
-from logs.recording.topics import COORDINATOR_HEADER, ISSUED, are_identical
+from logs.recording.sender_choices import RepeatedSender
+from logs.recording.topics import COORDINATOR_HEADER, CYCLE, ISSUED, SENDER_HEADER, SENT, are_identical
 from uavctl.arrays import SECOND_NS
 from uavctl.errors import RecordingError
 from uavctl.fleet.coordinator import CellParameters
-from uavctl.fleet_records import CoordinatorCycle, CoordinatorHeader, IssuedCell, TakenReport
+from uavctl.fleet_records import (
+    CoordinatorCycle,
+    CoordinatorHeader,
+    IssuedCell,
+    ScheduleWeights,
+    SenderHeader,
+    SentPosition,
+    TakenReport,
+)
 from uavctl.records import CellReport, Record
 from uavctl.wiring.cells import Coordinator
 
+FleetHeader = SenderHeader | CoordinatorHeader
 NOTHING = "nothing"
+# By the topic of the first message; of version 1, that of the only one.
+KINDS = {SENDER_HEADER: "sender", SENT: "sender", COORDINATOR_HEADER: "coordinator", CYCLE: "coordinator"}
 
 
 class FleetDifference(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,14 +91,7 @@ class _Comparison:
         )
 
     def make_result(self, kind: str, decisions: int, path: Path) -> FleetReplay:
-        """Make the result.
-
-        Raises:
-            RecordingError: The recording lacks records before its end.
-        """
-        note = read_last_note(path)
-        if note is not None and (note.lacks_records or note.dropped or note.refused):
-            raise RecordingError(f"{path}: lacks records ({note.text}), and what comes after cannot be replayed")
+        """Make the result."""
         return FleetReplay(
             kind=kind,
             decisions=decisions,
@@ -111,10 +118,9 @@ def replay_coordinator(path: Path) -> FleetReplay:
     Raises:
         RecordingError: It cannot be read, has no header (version 1), or lacks records.
     """
-    records = read(path)
-    header = next((one for topic, _, one in records if topic == COORDINATOR_HEADER), None)
+    header = read_fleet_header(path)
     if not isinstance(header, CoordinatorHeader):
-        raise RecordingError(f"{path}: has no reports to replay; it is of an earlier version, or not of a coordinator")
+        raise RecordingError(f"{path}: is not of a coordinator")
     numbers = {name: number for number, name in enumerate(header.names)}
     try:
         coordinator = Coordinator(parse_parameters(header.parameters), len(numbers))
@@ -123,7 +129,7 @@ def replay_coordinator(path: Path) -> FleetReplay:
     reports: dict[int, CellReport] = {}
     cells: list[IssuedCell] = []
     cycles, comparison = 0, _Comparison(0)
-    for _, at_ns, record in records:
+    for _, at_ns, record in read(path):
         if isinstance(record, TakenReport):
             reports[numbers[record.vehicle]] = record.report
         elif isinstance(record, IssuedCell):
@@ -140,6 +146,61 @@ def replay_coordinator(path: Path) -> FleetReplay:
     return comparison.make_result("coordinator", cycles, path)
 
 
+def replay_sender(path: Path) -> FleetReplay:
+    """Give a sender the recorded positions and reports; compare its weights, and whom it serves when.
+
+    Raises:
+        RecordingError: It cannot be read, has no header (version 1), or lacks records.
+    """
+    header = read_fleet_header(path)
+    if not isinstance(header, SenderHeader):
+        raise RecordingError(f"{path}: is not of a sender")
+    try:
+        sender = RepeatedSender(header)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
+    choices, comparison = 0, _Comparison(header.start_ns)
+    for topic, at_ns, record in read(path):
+        if isinstance(record, ScheduleWeights):
+            comparison.compare(topic, at_ns, record, sender.repeat_weights())
+        elif isinstance(record, SentPosition):
+            choices += 1
+            comparison.compare(topic, at_ns, record, sender.repeat_message(at_ns, record))
+        else:
+            sender.take(at_ns, record)
+    return comparison.make_result("sender", choices, path)
+
+
+def read_fleet_header(path: Path) -> FleetHeader:
+    """Read the header of a recording that can be replayed.
+
+    Raises:
+        RecordingError: It does not begin with one, or lacks records.
+    """
+    if _find_first_topic(path) not in (SENDER_HEADER, COORDINATOR_HEADER):
+        raise RecordingError(
+            f"{path}: has no header, and nothing to replay: it is of an earlier version, or its begin is lost"
+        )
+    note = read_last_note(path)
+    if note is not None and (note.lacks_records or note.dropped or note.refused):
+        raise RecordingError(f"{path}: lacks records ({note.text}), so what comes after cannot be replayed")
+    _, _, header = next(read(path))
+    assert isinstance(header, SenderHeader | CoordinatorHeader)  # the topic's type
+    return header
+
+
+def _find_first_topic(path: Path) -> str:
+    messages = (item for item in scan_recording(path) if isinstance(item, RecordedMessage))
+    return next((message.definition.topic for message in messages), "")
+
+
+def find_fleet_kind(path: Path) -> str:
+    """Return "sender" or "coordinator"; empty for a recording of another kind, or one that cannot be read."""
+    with suppress(RecordingError):
+        return KINDS.get(_find_first_topic(path), "")
+    return ""
+
+
 def _pair(
     recorded: Sequence[Record], replayed: Sequence[tuple[str, Record]]
 ) -> Iterator[tuple[str, Record | None, Record | None]]:
@@ -152,3 +213,6 @@ def _pair(
     ours, others = {key(record): record for record in recorded}, {key(record): record for _, record in replayed}
     for name in dict.fromkeys([*ours, *others]):
         yield topic_by_key.get(name, ISSUED), ours.get(name), others.get(name)
+
+
+REPLAYS = {"sender": replay_sender, "coordinator": replay_coordinator}  # by kind

@@ -12,15 +12,28 @@ import msgspec
 
 from logs.recording.design_view import get_config_name
 from logs.recording.file_scan import AttachedFile, Damage, EndOfFile, RecordedMessage
+from logs.recording.fleet_info import CoordinatorInfo, FleetAccount, SenderInfo
 from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader, VehicleParameter
 from logs.recording.reader import find_segments, scan_recording
-from logs.recording.topics import HEADER, LIBRARY, PARAMETER, RECORDER, decode, parse_raw_topic
+from logs.recording.topics import (
+    COORDINATOR_HEADER,
+    CYCLE,
+    HEADER,
+    LIBRARY,
+    PARAMETER,
+    RECORDER,
+    SENDER_HEADER,
+    SENT,
+    decode,
+    parse_raw_topic,
+)
 from uavctl.errors import RecordingError
 from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
 
-_OWN = (HEADER, LIBRARY, RECORDER)  # of the recording itself, not of the flight
-_LOOKED_INTO = (*_OWN, "/uavctl/link", "/uavctl/refused")
+_OF_FLEETS = (SENDER_HEADER, SENT, COORDINATOR_HEADER, CYCLE)
+_OWN = (HEADER, LIBRARY, RECORDER, SENDER_HEADER, COORDINATOR_HEADER)  # of the recording itself, not of the flight
+_LOOKED_INTO = (HEADER, LIBRARY, RECORDER, "/uavctl/link", "/uavctl/refused")
 _LATEST_ONLY = ("/uavctl/link_estimate", "/sim/truth")
 _PLAIN_NOTES = (NoteKind.BEGIN, NoteKind.END)
 
@@ -130,6 +143,8 @@ class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
     attachments: tuple[AttachmentInfo, ...] = ()
     parameters: dict[str, VehicleParameter] = {}  # of the vehicle, as it told them
     parameter_count: int | None = None  # parameters that it says it has
+    sender: SenderInfo | None = None  # of `sender.mcap`
+    coordinator: CoordinatorInfo | None = None  # of `coordinator.mcap`
 
 
 class _TopicTimes:
@@ -239,7 +254,7 @@ def read_info(path: Path) -> RecordingInfo:
     missing = 0
     following: int | None = None
     zero_utc_ns = 0
-    account = _Account()
+    account, fleet = _Account(), FleetAccount()
     newest: dict[str, RecordedMessage] = {}
     attachments: dict[str, AttachmentInfo] = {}  # each file of the recording has them, the last one all
     parameters = ParameterReader()
@@ -265,6 +280,8 @@ def read_info(path: Path) -> RecordingInfo:
         courses.setdefault(topic, _TopicTimes(item)).add(item)
         if topic in _LOOKED_INTO:
             account.add(decode(topic, item.data, item.at_ns))
+        elif topic in _OF_FLEETS:
+            fleet.add(item.at_ns, decode(topic, item.data, item.at_ns))
         elif topic in _LATEST_ONLY:
             newest[topic] = item
         elif topic == PARAMETER or parse_raw_topic(topic) is not None:
@@ -311,6 +328,8 @@ def read_info(path: Path) -> RecordingInfo:
         attachments=tuple(attachments.values()),
         parameters=parameters.parameters(),
         parameter_count=parameters.count,
+        sender=fleet.make_sender(),
+        coordinator=fleet.make_coordinator(),
     )
 
 

@@ -1,82 +1,60 @@
-"""Recording of a sender: one MCAP file with a JSON message for each position sent; its writer and its reader.
-
-A thread of its own writes, so that a disk that hangs delays no position.
-"""
+"""Recording of a sender: what its choices come from, and each position sent; its writer and its reader."""
 
 from __future__ import annotations
 
-import json
-import struct
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from queue import Full, Queue
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
 import msgspec
 import numpy as np
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Chunk, Message
-from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import Writer
 from numpy.typing import NDArray
-from zstandard import ZstdError, get_frame_parameters
 
-from logs.recording.budget import MAX_CHUNK_BYTES
+from logs.recording.file_scan import Damage, EndOfFile, RecordedMessage
+from logs.recording.reader import scan_recording
+from logs.recording.recorder import Recorder, RecorderStatus, SyncRecorder
+from logs.recording.topics import OFFERED, REPORTED, SENDER_HEADER, SENT, WEIGHTS, decode
 from uavctl.errors import RecordingError
-
-TOPIC = "/uavctl/sender"
-_SCHEMA = {
-    "title": "uavctl.SentPosition",
-    "type": "object",
-    "properties": {
-        "vehicle": {"type": "string"},
-        "captured_ns": {"type": "integer"},  # monotonic time of the capture
-        "bytes": {"type": "integer"},
-        # believed age of each vehicle's newest position before this message [s]
-        "ages_s": {"type": "object", "additionalProperties": {"type": "number"}},
-    },
-}
-CHUNK_BYTES = 65_536  # a killed process loses the messages of the last chunk, a few seconds
-MAX_WAITING = 10_000  # messages that wait for the disk: more than a minute on a radio of 57,600 baud
-CLOSE_S = 5.0  # for the messages that wait at the end
-_HANGS = "the disk hangs"
-_Item = tuple[int, int, int, int, tuple[float, ...]]
+from uavctl.fleet_records import OfferedPosition, ReportedPosition, ScheduleWeights, SenderHeader, SentPosition
+from uavctl.records import Record, Vec3
+from uavctl.wiring.controller import collect_versions, read_cpu_model
+from uavctl.wiring.radio import ScheduleParameters
 
 
 class SenderRecording:
-    """Writes what a sender did; `log_time` is UTC.
-
-    Attributes:
-        failure: Why nothing is written any more; empty as long as it is.
+    """Records what a sender does; a disk that fails or hangs delays no position.
 
     Args:
+        recorder: Recorder of a new file; with a thread of its own outside of virtual time.
         names: Names of the vehicles.
+        spacing_m: Smallest distance of two vehicles [m].
+        start_ns: Monotonic time of the start.
         zero_utc_ns: UTC of time 0 of the monotonic clock [ns since 1970].
-
-    Raises:
-        RecordingError: There is such a file, or it cannot be made.
     """
 
-    def __init__(self, path: Path, names: list[str], zero_utc_ns: int) -> None:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("xb")
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another file") from error
-        self._names, self._zero_utc_ns = names, zero_utc_ns
-        self.failure = ""
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
-        self._writer.start(profile="", library="uavctl")
-        schema = self._writer.register_schema("uavctl.SentPosition", "jsonschema", json.dumps(_SCHEMA).encode())
-        self._channel = self._writer.register_channel(TOPIC, "json", schema)
-        self._waiting: Queue[_Item | None] = Queue(MAX_WAITING)  # None is the end
-        self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
-        self._thread.start()
+    def __init__(
+        self,
+        recorder: Recorder | SyncRecorder,
+        names: Sequence[str],
+        parameters: ScheduleParameters,
+        *,
+        spacing_m: float,
+        start_ns: int,
+        zero_utc_ns: int,
+    ) -> None:
+        self._recorder, self._names = recorder, tuple(names)
+        header = SenderHeader(
+            zero_utc_ns=zero_utc_ns,
+            start_ns=start_ns,
+            names=self._names,
+            spacing_m=spacing_m,
+            versions=collect_versions(""),
+            cpu=read_cpu_model(),
+            **msgspec.structs.asdict(parameters),
+        )
+        recorder.put(SENDER_HEADER, start_ns, header)
 
     def __enter__(self) -> Self:
         return self
@@ -84,53 +62,39 @@ class SenderRecording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        with suppress(Full):
-            self._waiting.put(None, timeout=CLOSE_S)
-        self._thread.join(CLOSE_S)
-        if self._thread.is_alive():
-            self.failure = self.failure or _HANGS
+        self.close()
 
-    def add(self, at_ns: int, vehicle: int, captured_ns: int, length: int, ages_s: tuple[float, ...]) -> None:
-        """Add a position that was sent at `at_ns`, monotonic time; a write error ends the recording alone."""
-        try:
-            self._waiting.put_nowait((at_ns, vehicle, captured_ns, length, ages_s))
-        except Full:
-            self.failure = self.failure or _HANGS
+    @property
+    def failure(self) -> str:
+        """What is wrong; empty if the disk takes all records."""
+        return self._recorder.status().problem
 
-    def _write(self) -> None:
-        """Write what comes, up to the end; nothing more after a failure."""
-        while (item := self._waiting.get()) is not None:
-            self._attempt(partial(self._write_message, *item))
-        self._attempt(self._writer.finish)
-        with suppress(OSError):
-            self._file.close()
+    def close(self) -> RecorderStatus:
+        """End the recording."""
+        return self._recorder.close()
 
-    def _attempt(self, write: Callable[[], object]) -> None:
-        if self.failure:
-            return
-        try:
-            write()
-        except OSError as error:
-            self.failure = error.strerror or "write error"
+    def add_position(self, at_ns: int, vehicle: int, captured_ns: int, position_m: Vec3) -> None:
+        """Add a position that may be sent."""
+        record = OfferedPosition(vehicle=self._names[vehicle], captured_ns=captured_ns, position_m=position_m)
+        self._recorder.put(OFFERED, at_ns, record)
 
-    def _write_message(
-        self, at_ns: int, vehicle: int, captured_ns: int, length: int, ages_s: tuple[float, ...]
-    ) -> None:
-        message = {
-            "vehicle": self._names[vehicle],
-            "captured_ns": captured_ns,
-            "bytes": length,
-            "ages_s": dict(zip(self._names, ages_s, strict=True)),
-        }
-        time_ns = self._zero_utc_ns + at_ns
-        self._writer.add_message(self._channel, time_ns, json.dumps(message).encode(), time_ns)
+    def add_report(self, at_ns: int, vehicle: int, captured_ns: int) -> None:
+        """Add a report of a vehicle."""
+        self._recorder.put(REPORTED, at_ns, ReportedPosition(vehicle=self._names[vehicle], captured_ns=captured_ns))
 
+    def add_weights(self, at_ns: int, weights: Sequence[float]) -> None:
+        """Add the weights from now on."""
+        self._recorder.put(WEIGHTS, at_ns, ScheduleWeights(weights=dict(zip(self._names, weights, strict=True))))
 
-class _SentPosition(msgspec.Struct, frozen=True):
-    """A message of the recording, without what the reader does not use."""
-
-    vehicle: str
-    ages_s: dict[str, float]
+    def add(self, at_ns: int, vehicle: int, captured_ns: int, length: int, ages_s: Sequence[float]) -> None:
+        """Add a position that was sent at `at_ns`, monotonic time."""
+        record = SentPosition(
+            vehicle=self._names[vehicle],
+            captured_ns=captured_ns,
+            bytes=length,
+            ages_s=dict(zip(self._names, ages_s, strict=True)),
+        )
+        self._recorder.put(SENT, at_ns, record)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +111,48 @@ class ServedPositions:
         return np.asarray(self.at_ns[self.vehicles == self.names.index(name)], dtype=np.int64)
 
 
-_DECODER = msgspec.json.Decoder(_SentPosition)
-_ERRORS = (McapError, ZstdError, msgspec.MsgspecError, ValueError, OverflowError)
+class GoodPart:
+    """Records of a sender's or coordinator's recording, up to its end or its first damage.
+
+    Attributes:
+        fault: Why the recording is not whole; empty as long as it is, and known once all records are read.
+        zero_utc_ns: UTC of time 0 of the records' clock [ns]; 0 in recordings of version 1, whose times are UTC.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self.fault, self.zero_utc_ns = path, "", 0
+
+    def __iter__(self) -> Iterator[tuple[str, int, Record]]:
+        """Yield topic, log time [ns] and record.
+
+        Raises:
+            RecordingError: It cannot be read.
+        """
+        following = 1
+        for item in scan_recording(self._path):
+            if isinstance(item, RecordedMessage):
+                self.zero_utc_ns = item.zero_utc_ns
+                if item.sequence not in (0, following):  # version 1 counts none
+                    self.fault = f"{self._path}: message {item.sequence} where {following} should be"
+                    return
+                following = item.sequence + 1
+                topic = item.definition.topic
+                try:
+                    record = decode(topic, item.data, item.at_ns)
+                except RecordingError as error:
+                    self.fault = f"{self._path}: {error}"
+                    return
+                yield topic, item.at_ns, record
+            elif isinstance(item, Damage):
+                self.fault = str(item)
+                return
+            elif isinstance(item, EndOfFile) and not item.finished:
+                self.fault = f"{self._path}: the recording is torn, or still written"
+                return
 
 
 def read_sender(path: Path) -> ServedPositions:
-    """Read the recording of a sender up to its end, or to its first damage.
+    """Read which vehicles a sender served, up to the end of its recording, or to its first damage.
 
     Raises:
         RecordingError: It cannot be read, or holds no position before the damage.
@@ -160,40 +160,18 @@ def read_sender(path: Path) -> ServedPositions:
     times_ns: list[int] = []
     vehicles: list[int] = []
     numbers: dict[str, int] = {}
-    fault = ""
-    try:
-        with path.open("rb") as file:
-            for at_ns, position in _iterate_positions(file):
-                for name in (*position.ages_s, position.vehicle):
-                    numbers.setdefault(name, len(numbers))
-                times_ns.append(at_ns)
-                vehicles.append(numbers[position.vehicle])
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
-    except (EndOfFile, struct.error):
-        fault = f"{path}: the recording is torn, or still written"
-    except _ERRORS as error:
-        fault = f"{path}: the recording is damaged ({error or type(error).__name__})"
+    part = GoodPart(path)
+    for _, at_ns, record in part:
+        if isinstance(record, SenderHeader):
+            numbers = {name: number for number, name in enumerate(record.names)}
+        elif isinstance(record, SentPosition):
+            for name in (*record.ages_s, record.vehicle):
+                numbers.setdefault(name, len(numbers))
+            times_ns.append(at_ns + part.zero_utc_ns)
+            vehicles.append(numbers[record.vehicle])
     if not times_ns:
-        raise RecordingError(fault or f"{path}: the sender sent nothing")
+        raise RecordingError(part.fault or f"{path}: the sender sent nothing")
     order = np.argsort(np.array(times_ns, dtype=np.int64), kind="stable")
     return ServedPositions(
-        tuple(numbers), np.array(times_ns, dtype=np.int64)[order], np.array(vehicles, dtype=np.int64)[order], fault
+        tuple(numbers), np.array(times_ns, dtype=np.int64)[order], np.array(vehicles, dtype=np.int64)[order], part.fault
     )
-
-
-def _iterate_positions(file: BinaryIO) -> Iterator[tuple[int, _SentPosition]]:
-    """Yield the UTC [ns] and content of each message on the topic."""
-    channels: set[int] = set()
-    for record in StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK_BYTES).records:
-        if not isinstance(record, Chunk):
-            continue
-        if record.compression and get_frame_parameters(record.data).content_size != record.uncompressed_size:
-            raise ValueError("a chunk unpacks to another size than it claims")
-        if record.uncompressed_size > MAX_CHUNK_BYTES:
-            raise ValueError("a chunk is too large")
-        for item in breakup_chunk(record, validate_crc=True):
-            if isinstance(item, Channel) and item.topic == TOPIC:
-                channels.add(item.id)
-            elif isinstance(item, Message) and item.channel_id in channels:
-                yield item.log_time, _DECODER.decode(item.data)

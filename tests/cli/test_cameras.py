@@ -23,7 +23,8 @@ from patience import wait_until
 from places import ROOT
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.recording.sender import TOPIC
+from logs.recording.reader import explain_missing_end
+from logs.recording.topics import SENT
 from sim.fleet import make_fleet
 from sim.server import serve_all
 from uavctl.cli.app import run
@@ -81,7 +82,7 @@ def test_each_vehicle_gets_its_own_positions_within_the_budget(
         # 1 m apart; the cameras' noise is 3 mm
         assert all(abs(n - north) < 0.1 and abs(e - east) < 0.1 for n, e, _ in positions)
     with out.open("rb") as file:
-        messages = [message for _, _, message in make_reader(file).iter_messages(topics=[TOPIC])]
+        messages = [message for _, _, message in make_reader(file).iter_messages(topics=[SENT])]
     records = [json.loads(message.data) for message in messages]
     # Zeros at the end of a payload are not sent, so a frame may be shorter than 44 bytes
     assert max(record["bytes"] for record in records) <= 44
@@ -229,7 +230,7 @@ def test_signed_positions_are_taken_with_the_vehicles_key_alone(
             )
             wait_until(lambda: not signed[0].receive() and signed[0].refused["forged"] == 1, "it is refused")
     with (tmp_path / "out" / "sender.mcap").open("rb") as recording:
-        records = [json.loads(message.data) for _, _, message in make_reader(recording).iter_messages(topics=[TOPIC])]
+        records = [json.loads(message.data) for _, _, message in make_reader(recording).iter_messages(topics=[SENT])]
     assert max(record["bytes"] for record in records) <= 57
 
 
@@ -337,8 +338,9 @@ def test_ctrl_c_ends_it_with_a_whole_recording(tmp_path: Path) -> None:
         assert process.stderr is not None and "4 vehicles" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 1  # nobody was sent a position
+    assert not explain_missing_end(out)
     with out.open("rb") as file:
-        assert not list(make_reader(file).iter_messages())
+        assert not list(make_reader(file).iter_messages(topics=[SENT]))
 
 
 def test_an_older_recording_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

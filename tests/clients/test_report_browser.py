@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sender_recordings import open_sender_recording
 
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
-from logs.recording.sender import SenderRecording
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config import load_config
 from uavctl.lab.lockstep import fly_fleet
@@ -173,7 +173,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     flown = fly_fleet(prepared, folder)
     for path, name in zip(flown.paths, names, strict=True):
         path.parent.rename(folder / name)
-    with SenderRecording(folder / "sender.mcap", list(names), VIRTUAL_ZERO_UTC_NS) as recording:
+    with open_sender_recording(folder / "sender.mcap", names, VIRTUAL_ZERO_UTC_NS) as recording:
         for number in range(400):
             recording.add(number * 10_000_000, number % 2, 0, 44, (0.0, 0.0))
     uavctl("log", "report", str(folder), "--json")

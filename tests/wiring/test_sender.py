@@ -20,7 +20,14 @@ from uavctl.mavlink.connection import MOCAP, MavlinkConnection, make_links
 from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.messages import TimeSync
 from uavctl.records import PositionSample, Vec3
-from uavctl.wiring.radio import RadioConfig, build_fleet_values, build_message_values, compute_link_wait_s
+from uavctl.wiring.radio import (
+    RadioConfig,
+    build_schedule_parameters,
+    compute_fleet_costs,
+    compute_link_wait_s,
+    compute_slot_ns,
+    compute_vehicle_costs,
+)
 from uavctl.wiring.sender import UNUSED, PositionSender, SentPosition
 
 START_NS = 1_000_000_000_000
@@ -236,10 +243,13 @@ def test_vehicles_of_one_kind_are_computed_once_and_others_for_themselves() -> N
     fleet = read_fleet(ROOT / "docs" / "examples" / "radio.toml")
     configs = [member.config for member in fleet.members[:2]]
     configs.append(replace(configs[0], plant=replace(configs[0].plant, wind_std_mps2=(0.9, 0.9, 0.9))))
-    results = build_fleet_values(configs, RADIO)
+    results, slot_s = compute_fleet_costs(configs, RADIO), compute_slot_ns(RADIO) / 1e9
     assert results[0] is results[1]
-    for config, (values, stds_m) in zip(configs, results, strict=True):
-        expected_values, expected_stds_m = build_message_values(config, RADIO)
-        np.testing.assert_array_equal(values, expected_values)
+    for config, (costs, stds_m) in zip(configs, results, strict=True):
+        expected_costs, expected_stds_m = compute_vehicle_costs(config, slot_s)
+        np.testing.assert_array_equal(costs, expected_costs)
         np.testing.assert_array_equal(stds_m, expected_stds_m)
     assert results[2][0][-1] > results[0][0][-1]
+    parameters = build_schedule_parameters(configs, RADIO)
+    assert [vehicle.kind for vehicle in parameters.vehicles] == [0, 0, 1]
+    assert [len(costs) for costs in parameters.costs] == [len(results[0][0]), len(results[2][0])]

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from cyclopts import Parameter
 
 from logs.recording.ends import make_recording_path
+from logs.recording.recorder import Recorder
 from logs.recording.sender import SenderRecording
 from uavctl.cli.common import SPAN_S, Common, QuietJson
 from uavctl.cli.fleet_file import Fleet, Member, read_fleet
@@ -56,19 +57,22 @@ def cameras(
         raise ConfigError(tuple(problems))
     names = [member.name for member in fleet.members]
     sources = find_shared_sources([member.cameras for member in fleet.members])
-    sender = PositionSender(
-        [member.config for member in fleet.members],
-        sources,
-        fleet.radio,
-        spacing_m=fleet.spacing_m,
-        start_ns=monotonic_ns(),
-    )
+    configs, start_ns = [member.config for member in fleet.members], monotonic_ns()
+    sender = PositionSender(configs, sources, fleet.radio, spacing_m=fleet.spacing_m, start_ns=start_ns)
     path = make_recording_path(out, file.stem).with_name("sender.mcap")
     with (
         _open_connections(file, fleet, sources) as (source_links, target_links),
-        SenderRecording(path, names, read_zero_utc_ns()) as recording,
+        SenderRecording(
+            Recorder(path),
+            names,
+            sender.parameters,
+            spacing_m=fleet.spacing_m,
+            start_ns=start_ns,
+            zero_utc_ns=read_zero_utc_ns(),
+        ) as recording,
         stop_on_signals() as stopped,
     ):
+        sender.watch = recording
         print_message(f"sending the positions of {len(names)} vehicles, recording to {path}; Ctrl-C ends it")
         run = _Run(fleet, sender, recording, source_links, target_links)
         end_ns = None if duration is None else monotonic_ns() + round(duration * 1e9)
@@ -104,7 +108,7 @@ class _Run:
         self._connections |= {f"to {number}": target for number, target in enumerate(targets)}
         self._reported: set[str] = set()
         self._silent: set[int] = set()
-        self._reported_ns = 0
+        self._reported_ns, self._has_failed = 0, False
 
     def run_once(self) -> None:
         """Send what is due, then wait for data or for the channel."""
@@ -147,8 +151,10 @@ class _Run:
             for reason in connection.refused:
                 if reason.startswith(PROCESS_ENDED):
                     self._report_once(f"{side} {connection.url}: {reason}")
-        if self._recording.failure:
-            self._report_once(f"the recording lacks positions from now on ({self._recording.failure}); see to the disk")
+        failure = self._recording.failure
+        if failure and not self._has_failed:
+            print_message(f"the recording lacks positions ({failure}); see to the disk")
+        self._has_failed |= bool(failure)
 
     def _report_once(self, text: str) -> None:
         if text not in self._reported:

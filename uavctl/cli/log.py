@@ -121,7 +121,30 @@ def render_info(info: RecordingInfo) -> RenderableType:
         rate = f"{topic.rate_hz:.1f}/s" if topic.messages > 1 else ""
         gap = (f"{topic.longest_gap_s:.3f} s", f"{topic.longest_gap_at_s:.1f} s") if topic.longest_gap_s else ("", "")
         table.add_row(Text(topic.topic), str(topic.messages), rate, *gap)
-    return Group(Text(title), table, *map(Text, _list_facts(info)))
+    return Group(Text(title), table, *_make_fleet_tables(info), *map(Text, _list_facts(info)))
+
+
+def _make_fleet_tables(info: RecordingInfo) -> Iterator[Table]:
+    """Return tables on a sender's messages, or on a coordinator's cycles."""
+    if (sender := info.sender) is not None:
+        rows = [
+            [name, str(one.messages), _format_span(one.mean_wait_s), _format_span(one.longest_wait_s)]
+            for name, one in sender.vehicles.items()
+        ]
+        headings = ("vehicle", "messages", "mean wait", "longest wait")
+        yield make_table(f"sender, schedule {sender.schedule or 'unknown'}", headings, rows)
+    if (coordinator := info.coordinator) is not None:
+        reasons = sorted({reason for counts in coordinator.waits.values() for reason in counts})
+        rows = [
+            [name, str(coordinator.cells[name]), *(str(counts.get(reason, 0)) for reason in reasons)]
+            for name, counts in coordinator.waits.items()
+        ]
+        title = f"coordinator: {coordinator.cycles} cycles, longest gap {coordinator.longest_gap_s:.3f} s"
+        yield make_table(title, ("vehicle", "cells", *reasons), rows)
+
+
+def _format_span(span_s: float | None) -> str:
+    return "" if span_s is None else f"{span_s:.3f} s"
 
 
 def _list_facts(info: RecordingInfo) -> Iterator[str]:

@@ -10,12 +10,13 @@ from typing import Annotated
 import msgspec
 from cyclopts import Parameter
 
+from logs.recording.fleet_replay import REPLAYS, find_fleet_kind, read_fleet_header
 from logs.recording.summary import count
 from logs.recording.tlog import TlogPacket, replay_tlog
 from uavctl.cli.common import DEFAULTS, Common, Flight, System, locate_design_errors
 from uavctl.cli.output import warn
-from uavctl.cli.replay_table import make_foreign_table, make_replay_table
-from uavctl.cli.replays import ReplayOutcome, read_foreign_vehicle, replay_flight
+from uavctl.cli.replay_table import make_fleet_table, make_foreign_table, make_replay_table
+from uavctl.cli.replays import ReplayOutcome, find_other_versions, match_arithmetic, read_foreign_vehicle, replay_flight
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import VEHICLE
@@ -39,6 +40,8 @@ def replay(
     """Drive the recorded inputs through the same control loop and compare all that it decides."""
     if not 0.0 <= tolerance < 1.0:
         raise UsageError(f"--tolerance {tolerance:g}: it is a share of a number; give 0 or more, and less than 1")
+    if (kind := find_fleet_kind(flight)) and not (common.overrides or topic or system is not None):
+        return _replay_fleet(flight, kind, common)
     packets = read_foreign_vehicle(flight, topic, system)
     if packets is not None:
         return _replay_foreign(flight, packets, common)
@@ -58,6 +61,20 @@ def replay(
         "texts_compared": not replayed.has_other_texts,
     }
     common.show("log/replay", document, lambda: make_replay_table(replayed))
+    return 0 if result.identical else 1
+
+
+def _replay_fleet(flight: Path, kind: str, common: Common) -> int:
+    """Replay the recording of a fleet's sender or coordinator."""
+    header = read_fleet_header(flight)
+    match_arithmetic(header)
+    result, other_versions = REPLAYS[kind](flight), find_other_versions(header, "")
+    for text in other_versions:
+        warn(f"{text}: decisions may differ")
+    if result.lacks_end:
+        warn(f"{result.lacks_end}: compared up to there")
+    document = {**msgspec.structs.asdict(result), "other_versions": other_versions}
+    common.show("log/replay-fleet", document, lambda: make_fleet_table(result))
     return 0 if result.identical else 1
 
 

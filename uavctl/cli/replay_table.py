@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from rich.console import Group, RenderableType
 from rich.table import Table
 
+from logs.recording.fleet_replay import FleetReplay
 from logs.recording.replay import Chosen, Context, FieldDivergence, ReplayDifference
 from logs.recording.tlog import ForeignReplay
 from uavctl.cli.output import format_counts, make_pair_table, make_table
@@ -46,6 +47,22 @@ def make_replay_table(replayed: ReplayOutcome) -> RenderableType:
         if decision != first:
             rows += _describe_difference("first such decision", decision)
     return Group(make_pair_table("Replay", rows), _make_course_table(result.course))
+
+
+def make_fleet_table(result: FleetReplay) -> RenderableType:
+    """Return the outcome of the replay of a sender or a coordinator as a table."""
+    rows: list[tuple[str, object]] = [
+        ("messages" if result.kind == "sender" else "cycles", result.decisions),
+        ("records compared", result.compared),
+        ("identical, bit for bit", "yes" if result.identical else "no"),
+    ]
+    if (first := result.first_difference) is not None:
+        rows += [
+            ("first difference", f"{first.at_s:.3f} s after the begin (log time {first.at_ns} ns)"),
+            ("", f"{first.topic} {first.field}".rstrip()),
+            ("", f"recorded {_shorten(first.recorded)}, replayed {_shorten(first.replayed)}"),
+        ]
+    return make_pair_table(f"Replay of the {result.kind}", rows)
 
 
 def _describe_difference(title: str, difference: ReplayDifference) -> Iterator[tuple[str, object]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 
+from logs.recording.fleet_replay import FleetHeader
 from logs.recording.foreign import read_foreign_packets
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import explain_missing_end, read_header, read_kind, read_last_note, read_messages
@@ -201,7 +202,7 @@ def _find_changes(recorded: object, replayed: object, key: str) -> Iterator[Chan
         yield ChangedKey(key=key, recorded=str(recorded), replayed=str(replayed))
 
 
-def match_arithmetic(recorded: Header) -> None:
+def match_arithmetic(recorded: Header | FleetHeader) -> None:
     """Restart the process if a recording was made with all instructions of this processor.
 
     This is the case if numpy was loaded before `uavctl`, or if the user chose it.
@@ -210,7 +211,7 @@ def match_arithmetic(recorded: Header) -> None:
         restart_process(without_choice(os.environ))
 
 
-def find_other_versions(recorded: Header, controller: str) -> tuple[str, ...]:
+def find_other_versions(recorded: Header | FleetHeader, controller: str) -> tuple[str, ...]:
     """Return the versions of code, libraries and arithmetic that differ from the recording's; the last bits need them.
 
     Args:

@@ -155,7 +155,15 @@ class RecordedSender:
         self.receive_positions, self.receive_reports = sender.receive_positions, sender.receive_reports
         self.compute_remaining_ns = sender.compute_remaining_ns
         names = [f"vehicle-{config.sim.system_id}" for config in configs]
-        self._recording = SenderRecording(path, names, VIRTUAL_ZERO_UTC_NS)
+        self._recording = SenderRecording(
+            BatchRecorder(path),
+            names,
+            sender.parameters,
+            spacing_m=spacing_m,
+            start_ns=0,
+            zero_utc_ns=VIRTUAL_ZERO_UTC_NS,
+        )
+        sender.watch = self._recording
 
     def send_next(self, at_ns: int) -> SentPosition | SentAnswer | None:
         """Return the message that goes out now, and record a position; see `PositionSender`."""
@@ -170,9 +178,8 @@ class RecordedSender:
         Raises:
             RecordingError: It lacks messages.
         """
-        self._recording.__exit__(None, None, None)
-        if self._recording.failure:
-            raise RecordingError(f"sender.mcap lacks messages ({self._recording.failure}); see to the disk")
+        if problem := self._recording.close().problem:
+            raise RecordingError(f"sender.mcap lacks messages ({problem}); see to the disk")
 
 
 class LockstepFleet:

@@ -16,6 +16,8 @@ from uavctl.arrays import SECOND_NS, Array
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.types import Config
+from uavctl.fleet_records import ScheduledVehicle
+from uavctl.records import Vec3
 from uavctl.schedule.ages import compute_periodic_tail
 from uavctl.schedule.channel import TIMESYNC_PAYLOAD_BYTES, Budget, compute_frame_bytes
 from uavctl.schedule.scheduler import ScheduleName, Scheduler
@@ -184,33 +186,71 @@ def compute_vehicle_costs(config: Config, slot_s: float) -> tuple[Array, Array]:
     return compute_age_costs(covs, state_cost[:size, :size]), np.sqrt(covs[:, index, index].max(axis=1))
 
 
-def build_message_values(config: Config, radio: RadioConfig) -> tuple[Array, Array]:
-    """Return V(h) of a vehicle (n,), and the deviation of its position at ages of 0 … slots (n + 1,) [m]."""
-    costs, stds_m = compute_vehicle_costs(config, compute_slot_ns(radio) / SECOND_NS)
-    return compute_message_values(costs, radio.loss), stds_m
-
-
-def build_fleet_values(configs: Sequence[Config], radio: RadioConfig) -> list[tuple[Array, Array]]:
-    """Return `build_message_values` of each vehicle, computed once for vehicles of one kind."""
-    replace, known, results = msgspec.structs.replace, list[tuple[Config, tuple[Array, Array]]](), []
+def compute_fleet_costs(configs: Sequence[Config], radio: RadioConfig) -> list[tuple[Array, Array]]:
+    """Return `compute_vehicle_costs` of each vehicle, computed once for vehicles of one kind."""
+    replace, slot_s = msgspec.structs.replace, compute_slot_ns(radio) / SECOND_NS
+    known, results = list[tuple[Config, tuple[Array, Array]]](), []
     for config in configs:
-        # What differs between vehicles of one kind, and has no part in the values
+        # What differs between vehicles of one kind, and has no part in the costs
         daemon = replace(config.daemon, vehicle="", mocap="")
         first = configs[0]
         kind = replace(
             config, daemon=daemon, security=first.security, sets=first.sets, target=first.target, sim=first.sim
         )
-        values = next((values for other, values in known if other == kind), None)
-        if values is None:
-            values = build_message_values(config, radio)
-            known.append((kind, values))
-        results.append(values)
+        costs = next((costs for other, costs in known if other == kind), None)
+        if costs is None:
+            costs = compute_vehicle_costs(config, slot_s)
+            known.append((kind, costs))
+        results.append(costs)
     return results
 
 
 def compute_quantile(config: Config) -> float:
     """Return κ of the allowed risk, Φ⁻¹(δ_x)."""
     return NormalDist().inv_cdf(config.smpc.delta_x)
+
+
+class ScheduleParameters(msgspec.Struct, frozen=True, kw_only=True):
+    """Constants of the schedule of a radio for some vehicles."""
+
+    schedule: ScheduleName
+    slot_ns: int  # time of a position on the channel
+    max_wait_slots: int
+    loss: float
+    feedback_ns: int  # longest time to a report; 0: none comes
+    costs: tuple[tuple[float, ...], ...]  # of an age of 0, 1 … slots, one row a kind of vehicle
+    vehicles: tuple[ScheduledVehicle, ...]
+
+
+def build_schedule_parameters(configs: Sequence[Config], radio: RadioConfig) -> ScheduleParameters:
+    """Build the constants of a radio's schedule.
+
+    Raises:
+        DesignError: A plant is not valid.
+    """
+    max_wait_slots, kinds, vehicles = compute_max_wait_slots(radio, len(configs)), list[Array](), []
+    for config, (costs, stds_m) in zip(configs, compute_fleet_costs(configs, radio), strict=True):
+        kind = next((number for number, known in enumerate(kinds) if known is costs), len(kinds))
+        kinds += [costs] if kind == len(kinds) else []
+        lower_m, upper_m = zip(*get_position_limits_m(config).values(), strict=True)
+        vehicles.append(
+            ScheduledVehicle(
+                kind=kind,
+                wait_std_m=float(stds_m[min(max_wait_slots, len(stds_m) - 1)]),
+                quantile=compute_quantile(config),
+                lower_m=lower_m,
+                upper_m=upper_m,
+            )
+        )
+    return ScheduleParameters(
+        schedule=radio.schedule,
+        slot_ns=compute_slot_ns(radio),
+        max_wait_slots=max_wait_slots,
+        loss=radio.loss,
+        feedback_ns=round(radio.feedback_s * SECOND_NS),
+        costs=tuple(tuple(row.tolist()) for row in kinds),
+        vehicles=tuple(vehicles),
+    )
 
 
 class RadioSchedule:
@@ -220,27 +260,23 @@ class RadioSchedule:
         scheduler: Chooses the vehicle of each message.
 
     Args:
-        configs: Configuration of each vehicle.
         start_ns: Time of the start [ns].
 
     Raises:
-        DesignError: A plant is not valid, or the longest wait has no slot for each vehicle.
+        DesignError: The longest wait has no slot for each vehicle.
     """
 
-    def __init__(self, configs: Sequence[Config], radio: RadioConfig, start_ns: int) -> None:
-        max_wait_slots = compute_max_wait_slots(radio, len(configs))
-        values, stds_m = zip(*build_fleet_values(configs, radio), strict=True)
-        self._wait_stds_m = [float(stds[min(max_wait_slots, len(stds) - 1)]) for stds in stds_m]
-        self._quantiles = [compute_quantile(config) for config in configs]
-        limits = [list(zip(*get_position_limits_m(config).values(), strict=True)) for config in configs]
-        self._limits_m = [(np.array(lower), np.array(upper)) for lower, upper in limits]
+    def __init__(self, parameters: ScheduleParameters, start_ns: int) -> None:
+        self._vehicles = parameters.vehicles
+        self._limits_m = [(np.array(vehicle.lower_m), np.array(vehicle.upper_m)) for vehicle in parameters.vehicles]
+        values = [compute_message_values(np.array(costs), parameters.loss) for costs in parameters.costs]
         self.scheduler = Scheduler(
-            radio.schedule,
-            np.array(values),
-            slot_ns=compute_slot_ns(radio),
-            max_wait_slots=max_wait_slots,
-            loss=radio.loss,
-            feedback_delay_ns=round(radio.feedback_s * SECOND_NS),
+            parameters.schedule,
+            np.array([values[vehicle.kind] for vehicle in parameters.vehicles]),
+            slot_ns=parameters.slot_ns,
+            max_wait_slots=parameters.max_wait_slots,
+            loss=parameters.loss,
+            feedback_delay_ns=parameters.feedback_ns,
             start_ns=start_ns,
         )
 
@@ -252,12 +288,11 @@ class RadioSchedule:
             half_gaps_m: Half of the free distance to the nearest other vehicle (N,).
         """
         for i in np.flatnonzero(np.isfinite(positions_m[:, 0])).tolist():
-            lower_m, upper_m = self._limits_m[i]
+            vehicle, (lower_m, upper_m) = self._vehicles[i], self._limits_m[i]
             columns = positions_m[i, : len(lower_m)]
             wall_m = min((columns - lower_m).min(), (upper_m - columns).min())
             distance_m = min(float(wall_m), float(half_gaps_m[i]))
-            weight = compute_weight(distance_m, self._wait_stds_m[i], self._quantiles[i])
-            self.scheduler.vehicles[i].weight = weight
+            self.scheduler.vehicles[i].weight = compute_weight(distance_m, vehicle.wait_std_m, vehicle.quantile)
 
 
 def compute_half_gaps_m(positions_m: Array, spacing_m: float) -> Array:
@@ -276,3 +311,31 @@ def compute_half_gaps_m(positions_m: Array, spacing_m: float) -> Array:
     np.fill_diagonal(gaps_m, np.inf)
     half_gaps_m[known] = 0.5 * gaps_m.min(axis=1, initial=np.inf)
     return half_gaps_m
+
+
+class PlacedSchedule(RadioSchedule):
+    """Schedule that knows the newest position of each vehicle.
+
+    Args:
+        spacing_m: Smallest distance of two vehicles [m].
+    """
+
+    def __init__(self, parameters: ScheduleParameters, spacing_m: float, start_ns: int) -> None:
+        super().__init__(parameters, start_ns)
+        self._spacing_m, self._positions_m = spacing_m, np.full((len(parameters.vehicles), 3), np.inf)
+
+    @property
+    def weights(self) -> list[float]:
+        """Weights of the vehicles."""
+        return [vehicle.weight for vehicle in self.scheduler.vehicles]
+
+    def add_position(self, number: int, captured_ns: int, position_m: Vec3) -> bool:
+        """Note a vehicle's newest position; return False for one that is not newer."""
+        is_newer = self.scheduler.add_position(number, captured_ns)
+        if is_newer:
+            self._positions_m[number] = position_m
+        return is_newer
+
+    def update_placed_weights(self) -> None:
+        """Set the weights by the newest positions."""
+        self.update_weights(self._positions_m, compute_half_gaps_m(self._positions_m, self._spacing_m))

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import msgspec
-import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.arrays import SECOND_NS
@@ -39,7 +38,13 @@ from uavctl.mavlink.messages import Message, Position, TimeSync
 from uavctl.mavlink.positions import PositionDecoder
 from uavctl.records import PositionSample, Vec3
 from uavctl.schedule.channel import SIGNATURE_BYTES, BudgetedChannel
-from uavctl.wiring.radio import RadioConfig, RadioSchedule, compute_answer_period_ns, compute_half_gaps_m, make_budget
+from uavctl.wiring.radio import (
+    PlacedSchedule,
+    RadioConfig,
+    build_schedule_parameters,
+    compute_answer_period_ns,
+    make_budget,
+)
 
 COMPONENT_ID = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 WEIGHT_PERIOD_NS = SECOND_NS // 10  # between two updates of the weights: a vehicle moves 15 cm at 1.5 m/s
@@ -66,6 +71,22 @@ class SentAnswer(NamedTuple):
 
     vehicle: int
     frame: bytes
+
+
+class ScheduleWatch(Protocol):
+    """Interface of a recording of what the choices of a sender come from; times are monotonic [ns]."""
+
+    def add_position(self, at_ns: int, vehicle: int, captured_ns: int, position_m: Vec3) -> None:
+        """Add a position that may be sent."""
+        ...
+
+    def add_report(self, at_ns: int, vehicle: int, captured_ns: int) -> None:
+        """Add a report of a vehicle."""
+        ...
+
+    def add_weights(self, at_ns: int, weights: Sequence[float]) -> None:
+        """Add the weights from now on."""
+        ...
 
 
 class _Source:
@@ -115,7 +136,6 @@ class _Target:
         self.frame = Frame(config.frame.convention, config.frame.origin_m, config.frame.yaw_deg)
         self.decoder = PositionDecoder(config.frame, config.clock, source, config.estimator, count)
         self.encoder = Encoder(CAMERA_SYSTEM_ID, COMPONENT_ID)
-        self.position_m: Vec3 | None = None  # newest one, local NED
         self.received_ns = start_ns  # of the newest one
         self.next_frame: tuple[Vec3, Vec3] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))  # position, angles
         self.source_stamp_us = 0  # stamp of the newest one, in its source's clock
@@ -134,6 +154,8 @@ class PositionSender:
 
     Attributes:
         refused: Counts of positions that were not used, by reason.
+        parameters: Constants of the schedule.
+        watch: Gets what the choices come from; None: nobody.
 
     Args:
         configs: Configuration of each vehicle.
@@ -157,6 +179,7 @@ class PositionSender:
         keeps_stamps: bool = False,
     ) -> None:
         self._keeps_stamps = keeps_stamps
+        self.watch: ScheduleWatch | None = None
         self.refused: Counter[str] = Counter()
         self.sent = Counter[int]()
         self._sources = [_Source(source) for source in sources]
@@ -167,9 +190,10 @@ class PositionSender:
         ]
         self._signature_bytes = SIGNATURE_BYTES if radio.signed else 0
         self._answer_period_ns, self._answered_ns = compute_answer_period_ns(radio, len(configs)), start_ns
-        self._spacing_m, self._weighted_ns = spacing_m, start_ns
+        self._weighted_ns = start_ns
         self._channel = BudgetedChannel(make_budget(radio))
-        self._schedule = RadioSchedule(configs, radio, start_ns)
+        self.parameters = build_schedule_parameters(configs, radio)
+        self._schedule = PlacedSchedule(self.parameters, spacing_m, start_ns)
         self._scheduler = self._schedule.scheduler
 
     def make_time_request(self, source: int, at_ns: int) -> bytes | None:
@@ -202,11 +226,13 @@ class PositionSender:
         sample = target.decoder.make_sample(message, at_ns)
         if sample is None or not target.is_plausible(sample):
             self.refused[UNUSED] += 1
-        elif self._scheduler.add_position(number, sample.captured_ns):
+        elif self._schedule.add_position(number, sample.captured_ns, sample.position_m):
+            if self.watch is not None:
+                self.watch.add_position(at_ns, number, sample.captured_ns, sample.position_m)
             attitude = target.decoder.attitude
             rotation = None if attitude is None else target.frame.attitude_from_ned(attitude, euler=True)
             angles = (0.0, 0.0, 0.0) if rotation is None else euler_from_quaternion(rotation)
-            target.position_m, target.received_ns = sample.position_m, at_ns
+            target.received_ns = at_ns
             target.source_stamp_us = message.stamp_us or 0
             target.next_frame = target.frame.from_ned(sample.position_m), angles
         return target.decoder.is_settled
@@ -228,6 +254,8 @@ class PositionSender:
                 captured_ns = target.captured_ns_by_stamp.get(ping.time_usec)
                 if (ping.target_system, ping.target_component) == (CAMERA_SYSTEM_ID, COMPONENT_ID) and captured_ns:
                     self._scheduler.add_feedback(number, captured_ns, at_ns)
+                    if self.watch is not None:
+                        self.watch.add_report(at_ns, number, captured_ns)
 
     def compute_remaining_ns(self, at_ns: int) -> int:
         """Return the time until the channel is free [ns]."""
@@ -243,7 +271,9 @@ class PositionSender:
             return answer
         if at_ns - self._weighted_ns >= WEIGHT_PERIOD_NS:
             self._weighted_ns = at_ns
-            self._update_weights()
+            self._schedule.update_placed_weights()
+            if self.watch is not None:
+                self.watch.add_weights(at_ns, self._schedule.weights)
         number = self._scheduler.choose(at_ns)
         if number is None:
             return None
@@ -281,7 +311,3 @@ class PositionSender:
         token, received_ns = target.request
         target.request, target.answered_ns, self._answered_ns = None, at_ns, at_ns
         return SentAnswer(number, target.encoder.encode_timesync((received_ns + at_ns) // 2, token))
-
-    def _update_weights(self) -> None:
-        positions_m = np.array([target.position_m or (np.inf,) * 3 for target in self._targets])
-        self._schedule.update_weights(positions_m, compute_half_gaps_m(positions_m, self._spacing_m))

@@ -114,7 +114,7 @@ def test_a_recording_of_another_kind_is_refused(tmp_path: Path) -> None:
     cell = CellMessage(exits=0, number=1, step=0, lower_m=((0.0,) * 3,), upper_m=((1.0,) * 3,), goal_m=(0.0,) * 3)
     recorder.put(ISSUED, 0, IssuedCell(vehicle="a", cell=cell))
     recorder.close()
-    with pytest.raises(RecordingError, match="no reports"):
+    with pytest.raises(RecordingError, match="no header"):
         replay_coordinator(tmp_path / "other.mcap")
 
 

@@ -17,13 +17,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from recording_fakes import stored_byte
 from report_rig import walk_html
+from sender_recordings import open_sender_recording
 from synthetic_flight import fly, header
 from synthetic_scene import room
 
 from logs.recording.design_view import read_design
 from logs.recording.reader import read, read_header, read_kind
 from logs.recording.recorder import SyncRecorder
-from logs.recording.sender import SenderRecording, read_sender
+from logs.recording.sender import read_sender
 from logs.report.approach import MAX_GAP_NS, Track, find_closest_approach
 from uavctl.cli.app import run
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
@@ -195,7 +196,7 @@ MESSAGE_NS = 20_000_000
 def make_sender(path: Path, zero_utc_ns: int = UTC_NS) -> Path:
     """A sender's recording with the known order, from 5 s of the flight's clock on."""
     names = ["d", "b", "c", "a"]
-    with SenderRecording(path, names, zero_utc_ns) as recording:
+    with open_sender_recording(path, names, zero_utc_ns) as recording:
         for number, name in enumerate(ORDER):
             at_ns = 5_000_000_000 + MESSAGE_NS * number
             recording.add(at_ns, names.index(name), at_ns - 1, 44, (0.0,) * len(names))

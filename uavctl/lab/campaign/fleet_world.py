@@ -25,7 +25,7 @@ from uavctl.schedule.channel import BudgetedChannel, compute_frame_bytes
 from uavctl.smpc.batch import BatchSmpc, Counts, Decider, Decisions, Information
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.wiring.controller import build_conditioned, build_problem, make_start_state
-from uavctl.wiring.radio import RadioConfig, RadioSchedule, make_budget
+from uavctl.wiring.radio import RadioConfig, RadioSchedule, build_schedule_parameters, make_budget
 
 WEIGHT_STEPS_S = 0.1  # between two updates of the weights, as in `uavctl cameras`
 _ROUNDING_NS = 1  # of a delay
@@ -213,7 +213,8 @@ class LinearFleet:
         for number, vehicle in enumerate(self.vehicles):
             groups.setdefault(self.vehicles.index(vehicle), []).append(number)
         pilots = [_Pilot(self.vehicles[number], numbers, runs, steps) for number, numbers in groups.items()]
-        schedules = [RadioSchedule([vehicle.config for vehicle in self.vehicles], self.radio, 0) for _ in range(runs)]
+        parameters = build_schedule_parameters([vehicle.config for vehicle in self.vehicles], self.radio)
+        schedules = [RadioSchedule(parameters, 0) for _ in range(runs)]
         chosen = [schedule.scheduler if make_schedule is None else make_schedule(self) for schedule in schedules]
         count, n_w = len(self.vehicles), pilots[0].plant.n_w
         most = 2 + steps * (2 + self.dt_ns // make_budget(self.radio).compute_slot_ns(self.frame_bytes))
