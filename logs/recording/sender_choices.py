@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from logs.recording.sender import GoodPart
 from uavctl.arrays import Array
-from uavctl.errors import RecordingError
+from uavctl.errors import DesignError, RecordingError
 from uavctl.fleet_records import OfferedPosition, ReportedPosition, ScheduleWeights, SenderHeader, SentPosition
 from uavctl.records import Record
 from uavctl.schedule.cost import MessageAccount
@@ -97,18 +99,26 @@ class _Course:
         self._account = MessageAccount(costs, parameters.slot_ns, parameters.loss, start_ns)
         self.costs, self.ages_s = np.zeros(len(costs)), np.zeros(len(costs))
 
-    def add(self, at_ns: int, weights: list[float], number: int | None, captured_ns: int) -> None:
-        """Add the costs and ages before a message, and the message if there is one."""
+    def add_costs(self, at_ns: int, weights: list[float]) -> None:
+        """Add the costs and ages at a time."""
         self.costs += self._account.compute_costs(at_ns, weights)
         self.ages_s += self._account.compute_ages_s(at_ns)
-        if number is not None:
-            self._account.add_message(number, captured_ns, at_ns)
+
+    def add_message(self, at_ns: int, number: int, captured_ns: int) -> None:
+        """Note a message."""
+        self._account.add_message(number, captured_ns, at_ns)
 
 
 class RoundRobinComparison:
-    """Comparison of a recorded sender with round-robin: the same positions, times of messages and weights."""
+    """Comparison of a recorded sender with round-robin: the same positions, times of messages and weights.
 
-    def __init__(self, header: SenderHeader) -> None:
+    Args:
+        begin_ns: UTC from which messages count [ns].
+        end_ns: UTC of the last one [ns].
+    """
+
+    def __init__(self, header: SenderHeader, begin_ns: int, end_ns: int) -> None:
+        self._first_ns, self._last_ns = begin_ns - header.zero_utc_ns, end_ns - header.zero_utc_ns
         parameters = parse_schedule(header)
         self._header, self._weights = header, [1.0] * len(header.names)
         self._numbers = {name: number for number, name in enumerate(header.names)}
@@ -124,11 +134,14 @@ class RoundRobinComparison:
         elif isinstance(record, ScheduleWeights):
             self._weights = [record.weights[name] for name in self._header.names]
         elif isinstance(record, SentPosition):
-            self._messages += 1
-            self._flown.add(at_ns, self._weights, self._numbers[record.vehicle], record.captured_ns)
+            if self._first_ns <= at_ns <= self._last_ns:
+                self._messages += 1
+                self._flown.add_costs(at_ns, self._weights)
+                self._other.add_costs(at_ns, self._weights)
+            self._flown.add_message(at_ns, self._numbers[record.vehicle], record.captured_ns)
             number = self._scheduler.choose(at_ns)
-            captured_ns = None if number is None else self._scheduler.vehicles[number].sent_ns
-            self._other.add(at_ns, self._weights, number, captured_ns or 0)
+            if number is not None and (captured_ns := self._scheduler.vehicles[number].sent_ns) is not None:
+                self._other.add_message(at_ns, number, captured_ns)
 
     def make_result(self) -> ScheduleComparison | None:
         """Make the result; None without a message, or without the positions that were there to send."""
@@ -143,3 +156,24 @@ class RoundRobinComparison:
             round_robin_costs=self._other.costs / self._messages,
             round_robin_ages_s=self._other.ages_s / self._messages,
         )
+
+
+def compare_with_round_robin(path: Path, begin_ns: int, end_ns: int) -> ScheduleComparison | None:
+    """Compare a recorded sender with round-robin over the messages of a span of UTC [ns].
+
+    Returns:
+        None for a recording of version 1, and without a message in the span.
+
+    Raises:
+        RecordingError: It cannot be read, or is not understood.
+    """
+    comparison: RoundRobinComparison | None = None
+    try:
+        for _, at_ns, record in GoodPart(path):
+            if isinstance(record, SenderHeader):
+                comparison = RoundRobinComparison(record, begin_ns, end_ns)
+            elif comparison is not None:
+                comparison.take(at_ns, record)
+    except (LookupError, ValueError, DesignError) as error:  # it was written so
+        raise RecordingError(f"{path}: is not understood ({type(error).__name__}: {error})") from error
+    return None if comparison is None else comparison.make_result()

@@ -19,6 +19,7 @@ from logs.recording.design_view import DesignView, parse_recorded_config
 from logs.recording.flight import FlightData
 from logs.recording.reader import explain_missing_end, read
 from logs.recording.sender import ServedPositions, read_sender
+from logs.recording.sender_choices import ScheduleComparison, compare_with_round_robin
 from logs.recording.summary import compute_position_errors_m, find_ending
 from logs.report.approach import LeastDistance, Times, Track, find_closest_approach
 from logs.report.excursion import select_trusted_estimates
@@ -129,6 +130,7 @@ class FleetRecording:
     approaches: tuple[LeastDistance, ...]
     collisions: tuple[FleetCollision, ...]
     sent: ServedPositions | None
+    schedule: ScheduleComparison | None  # of the sender, with round-robin
     contact_m: float | None  # least distance at which two simulated vehicles touch
     notes: tuple[str, ...]
 
@@ -198,11 +200,13 @@ def read_fleet(folder: Path) -> FleetRecording:
         approaches=tuple(_find_approaches(list(tracks.values()), encounters, names)),
         collisions=tuple(sorted(set(_find_collisions(encounters, names)))),
         sent=None,
+        schedule=None,
         contact_m=sum(radii_m[:2]) if len(radii_m) > 1 and all(track.is_true for track in tracks.values()) else None,
         notes=(),
     )
     sent = _read_sender(folder / SENDER, fleet, notes)
-    return replace(fleet, sent=sent, notes=tuple(notes))
+    schedule = None if sent is None else _compare_schedule(folder / SENDER, fleet, notes)
+    return replace(fleet, sent=sent, schedule=schedule, notes=tuple(notes))
 
 
 def _sort_key(name: str) -> list[tuple[int, str]]:
@@ -390,3 +394,12 @@ def _read_sender(path: Path, fleet: FleetRecording, notes: list[str]) -> ServedP
         at_ns=sent.at_ns[is_in_flight],
         vehicles=np.argsort(order)[sent.vehicles[is_in_flight]],
     )
+
+
+def _compare_schedule(path: Path, fleet: FleetRecording, notes: list[str]) -> ScheduleComparison | None:
+    """Compare the schedule of the sender with round-robin, over the messages during the flight."""
+    try:
+        return compare_with_round_robin(path, fleet.begin_ns, fleet.end_ns)
+    except RecordingError as error:
+        notes.append(f"the cost of the schedule is not shown: {error}")
+        return None

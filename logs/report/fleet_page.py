@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from logs.recording.output_files import write_atomically
 from logs.recording.sender import ServedPositions
+from logs.recording.sender_choices import ROUND_ROBIN
 from logs.report.approach import LeastDistance
 from logs.report.findings import Banner, seconds
 from logs.report.fleet import FleetRecording, RecordedVehicle, read_fleet
@@ -60,6 +61,24 @@ class PairFigures(msgspec.Struct, frozen=True, kw_only=True):
     source: str  # "truth" or "estimate"
 
 
+class ScheduledFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """Believed cost and age of a vehicle at the messages of the sender, as flown and with round-robin."""
+
+    cost: float
+    round_robin_cost: float
+    mean_age_s: float
+    round_robin_age_s: float
+
+
+class ScheduleFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """Comparison of the sender's schedule with round-robin."""
+
+    schedule: str
+    messages: int
+    cost_change: float | None  # cost over that of round-robin, less one
+    vehicles: dict[str, ScheduledFigures]
+
+
 class FleetFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a fleet's flight, as `--json` has them."""
 
@@ -69,6 +88,7 @@ class FleetFigures(msgspec.Struct, frozen=True, kw_only=True):
     pairs: tuple[PairFigures, ...]  # the closest first
     collisions: tuple[tuple[str, str, float], ...]  # names, and time [s]
     notes: tuple[str, ...]
+    schedule: ScheduleFigures | None  # None without a sender's recording of version 2
 
 
 def compute_vehicle_figures(vehicle: RecordedVehicle, sent: ServedPositions | None) -> VehicleFigures:
@@ -116,6 +136,25 @@ def compute_figures(fleet: FleetRecording, page: Path) -> FleetFigures:
         ),
         collisions=tuple((*one.names, float(fleet.to_seconds(one.at_ns))) for one in fleet.collisions),
         notes=fleet.notes,
+        schedule=compute_schedule_figures(fleet),
+    )
+
+
+def compute_schedule_figures(fleet: FleetRecording) -> ScheduleFigures | None:
+    """Compute the figures of the sender's schedule."""
+    one = fleet.schedule
+    if one is None:
+        return None
+    columns = (one.costs, one.round_robin_costs, one.ages_s, one.round_robin_ages_s)
+    fields = ScheduledFigures.__struct_fields__
+    return ScheduleFigures(
+        schedule=one.schedule,
+        messages=one.messages,
+        cost_change=one.change,
+        vehicles={
+            name: ScheduledFigures(**dict(zip(fields, (float(column[i]) for column in columns), strict=True)))
+            for i, name in enumerate(one.names)
+        },
     )
 
 
@@ -290,6 +329,40 @@ def _explain_messages(fleet: FleetRecording) -> str:
     return text
 
 
+def _show_schedule(fleet: FleetRecording) -> Iterator[Part]:
+    figures = compute_schedule_figures(fleet)
+    if figures is None:
+        return
+    rows = [
+        (
+            name,
+            f"{one.cost:.4g}",
+            f"{one.round_robin_cost:.4g}",
+            _format_change(one.cost / one.round_robin_cost - 1.0 if one.round_robin_cost > 0.0 else None),
+            f"{one.mean_age_s:.3f}",
+            f"{one.round_robin_age_s:.3f}",
+        )
+        for name, one in figures.vehicles.items()
+    ]
+    ones = figures.vehicles.values()
+    total, other_total = sum(one.cost for one in ones), sum(one.round_robin_cost for one in ones)
+    rows.append(("all", f"{total:.4g}", f"{other_total:.4g}", _format_change(figures.cost_change), "", ""))
+    flown = f"with {figures.schedule}" if figures.schedule != ROUND_ROBIN else "as flown"
+    columns = (
+        "vehicle",
+        f"cost {flown}",
+        f"with {ROUND_ROBIN}",
+        "change",
+        f"mean age {flown} [s]",
+        f"with {ROUND_ROBIN} [s]",
+    )
+    yield render_table(columns, rows, frozenset(range(1, len(columns))))
+
+
+def _format_change(change: float | None) -> str:
+    return "–" if change is None else f"{100 * change:+.1f} %"
+
+
 def _show_recordings(fleet: FleetRecording) -> Iterator[Part]:
     yield render_facts(
         (vehicle.name, f"{vehicle.recording} · {vehicle.header.started_utc} · {vehicle.header.command}")
@@ -327,6 +400,15 @@ SECTIONS: tuple[PageSection[FleetRecording], ...] = (
         when=lambda fleet: fleet.sent is not None,
         note=_explain_messages,
         legend=_list_styles,
+    ),
+    PageSection(
+        "Cost of the schedule",
+        _show_schedule,
+        when=lambda fleet: fleet.schedule is not None,
+        note=(
+            "Believed cost of the ages, the mean over all messages. Round-robin chooses from the same positions, at "
+            "the same times. Losses are those that the design expects; reports count for neither."
+        ),
     ),
     PageSection("Recordings", _show_recordings, is_closed=True),
 )

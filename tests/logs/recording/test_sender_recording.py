@@ -23,10 +23,10 @@ from logs.recording.reader import read
 from logs.recording.recorder import Recorder, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.sender import SenderRecording, read_sender
-from logs.recording.sender_choices import RoundRobinComparison, ScheduleComparison
+from logs.recording.sender_choices import ScheduleComparison, compare_with_round_robin
 from logs.recording.topics import SENT
 from uavctl.errors import RecordingError
-from uavctl.fleet_records import OfferedPosition, SenderHeader, SentPosition
+from uavctl.fleet_records import OfferedPosition, SentPosition
 from uavctl.schedule.scheduler import ScheduleName
 from uavctl.wiring.radio import PlacedSchedule, ScheduleParameters
 
@@ -155,14 +155,8 @@ def test_a_recording_that_lacks_records_is_not_replayed(tmp_path: Path) -> None:
     assert len(read_sender(tmp_path / "rest.mcap").at_ns) > len(read_sender(path).at_ns)
 
 
-def compare(path: Path) -> ScheduleComparison:
-    records = [(at_ns, record) for _, at_ns, record in read(path)]
-    header = records[0][1]
-    assert isinstance(header, SenderHeader)
-    comparison = RoundRobinComparison(header)
-    for at_ns, record in records[1:]:
-        comparison.take(at_ns, record)
-    result = comparison.make_result()
+def compare(path: Path, end_ns: int = 10**18) -> ScheduleComparison:
+    result = compare_with_round_robin(path, 0, end_ns)
     assert result is not None
     return result
 
@@ -177,6 +171,9 @@ def test_round_robin_costs_what_it_costs_by_hand_and_the_same_as_itself(tmp_path
     np.testing.assert_allclose(result.costs, slots.mean(axis=0) * [0.1, 1.0, 5.0])
     np.testing.assert_allclose(result.ages_s, slots.mean(axis=0) * SLOT_NS * 1e-9, atol=3e-6)
     assert result.change == 0.0
+    early = compare(path, 2 * SLOT_NS)
+    assert early.messages == 2
+    np.testing.assert_allclose(early.costs, slots[:2].mean(axis=0) * [0.1, 1.0, 5.0])
     assert np.array_equal(result.ages_s, result.round_robin_ages_s)
 
 
@@ -212,6 +209,6 @@ def test_recordings_of_version_1_are_read_and_recovered(tmp_path: Path) -> None:
     assert info.messages == 500 and not info.damage and info.finished
     result = recover(path, tmp_path / "again.mcap")
     assert result.messages == 500 and result.lost_bytes == 0
-    assert find_fleet_kind(path) == "sender"
+    assert find_fleet_kind(path) == "sender" and compare_with_round_robin(path, 0, 2 * 10**18) is None
     with pytest.raises(RecordingError, match="earlier version"):
         replay_sender(path)

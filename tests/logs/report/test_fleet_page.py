@@ -225,6 +225,29 @@ def test_messages_are_those_of_a_known_order(tmp_path: Path, capsys: pytest.Capt
     assert all(f'id="{key}"' in page for key in ("paths", "least-distance", "age-0", "age-3", "messages"))
 
 
+def test_the_cost_of_the_schedule_is_beside_that_of_round_robin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, name in enumerate("ab"):
+        make_vehicle(tmp_path / name, [0.1] * (200 * MESSAGE_NS // TICK_NS), north_m=float(number))
+    with open_sender_recording(tmp_path / "sender.mcap", "ab", UTC_NS) as recording:
+        for slot in range(100):
+            at_ns = 1_000_000_000 * 5 + MESSAGE_NS * slot
+            for number in range(2):
+                recording.add_position(at_ns, number, at_ns, (0.0, 3.0 * number, -1.0))
+            recording.add(at_ns, 0, at_ns, 44, (0.0, 0.0))  # always the first vehicle
+    schedule = report(tmp_path, capsys)["schedule"]
+    # The cost of an age is its number of slots, 99 at most. Without a position both have 99. Then the first has 1 as
+    # flown, and with round-robin 1 and 2 in turn, as the second from its first position on.
+    expected = {"a": (99 + 99 * 1, 99 + 50 * 1 + 49 * 2), "b": (100 * 99, 2 * 99 + 49 * 1 + 49 * 2)}
+    for name, (flown, other) in expected.items():
+        vehicle = schedule["vehicles"][name]
+        assert (vehicle["cost"], vehicle["round_robin_cost"]) == pytest.approx((flown / 100, other / 100))
+    totals = [sum(pair) for pair in zip(*expected.values(), strict=True)]
+    assert schedule["messages"] == 100 and schedule["cost_change"] == pytest.approx(totals[0] / totals[1] - 1.0)
+    assert "Cost of the schedule" in (tmp_path / "fleet.html").read_text()
+
+
 def test_a_torn_sender_recording_is_read_to_its_tear(tmp_path: Path) -> None:
     whole = make_sender(tmp_path / "sender.mcap")
     data, read_counts = whole.read_bytes(), set()
