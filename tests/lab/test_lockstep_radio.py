@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from logs.recording.fleet_replay import replay_sender
 from logs.recording.reader import read_kind
 from sim.simulation import FleetWorld, Seat
 from uavctl.arrays import SECOND_NS
@@ -60,6 +61,13 @@ RADIO = RadioConfig(bytes_per_s=BYTES_PER_S, rate_hz=20.0, schedule="oldest-firs
 def three(tmp_path_factory: pytest.TempPathFactory) -> FlownFleet:
     """Three vehicles on a radio for about one position in three, with reports at once."""
     return fly(tmp_path_factory.mktemp("three"), 3, RADIO, *PROMPT)
+
+
+def test_a_replay_of_the_sender_gives_each_message_again(three: FlownFleet) -> None:
+    assert three.sender_path is not None
+    result = replay_sender(three.sender_path)
+    assert result.identical and not result.lacks_end
+    assert result.decisions == len(read_sent(three)) > 60
 
 
 def test_no_second_carries_more_than_the_budget(three: FlownFleet) -> None:
