@@ -39,6 +39,10 @@ def need(package: str, extra: str) -> ModuleType:
         raise ExtraMissingError(package, extra) from missing
 
 
+class PlatformError(UsageError):
+    """A request needs what this operating system lacks."""
+
+
 class ConfigError(UavctlError):
     """The configuration is wrong; holds every problem found, not only the first."""
 

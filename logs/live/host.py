@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import resource
 import socket
 import sys
 from contextlib import suppress
@@ -87,6 +86,8 @@ class LiveHost:
 
 def main(arguments: list[str]) -> int:
     """Serve for the flight that started this process."""
+    import resource  # no system without it has this process
+
     feed_number, listener_number = map(int, arguments)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
     os.nice(_NICENESS)

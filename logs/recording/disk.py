@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import resource
 import shutil
 from pathlib import Path
 from typing import Protocol
 
 from uavctl.errors import RecordingError
+from uavctl.operating_system import O_BINARY, O_CLOEXEC
 
 
 class OutputFile(Protocol):
@@ -40,7 +40,7 @@ class DiskFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | O_CLOEXEC | O_BINARY, 0o644)
 
     def write(self, data: bytes) -> None:
         """Hand all of `data` to the operating system."""
@@ -119,6 +119,10 @@ def check_file_limit(segment_bytes: int) -> None:
     Raises:
         RecordingError: The process's limit of file sizes is lower.
     """
+    try:
+        import resource
+    except ImportError:  # a system without such limits
+        return
     limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
     if limit != resource.RLIM_INFINITY and limit < _FILE_SHARE * segment_bytes:
         raise RecordingError(

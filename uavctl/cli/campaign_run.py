@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -49,6 +48,7 @@ from uavctl.lab.campaign.trials import (
     read_trial,
 )
 from uavctl.lab.trial import COUNT_FIGURES, FIGURE_NOTE, SCENARIO_FIGURES
+from uavctl.operating_system import count_processors
 
 S = TypeVar("S", CellSummary, TrialSummary, FleetSummary)
 
@@ -124,9 +124,7 @@ def fly_campaign(
     try:
         description, tasks = campaign.prepare()
         with store.open(description, campaign.text, resume):
-            workers_context = (
-                open_processes(workers or len(os.sched_getaffinity(0))) if dask is None else open_cluster(dask)
-            )
+            workers_context = open_processes(workers or count_processors()) if dask is None else open_cluster(dask)
             if not _fly_tasks(store, tasks, workers_context):
                 raise KeyboardInterrupt
             print_message("writing the page")

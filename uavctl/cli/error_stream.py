@@ -147,6 +147,9 @@ def limit_output_wait() -> Iterator[None]:
     Raises:
         OutputError: Nobody reads standard output; all further output is discarded.
     """
+    if not hasattr(signal, "SIGALRM"):
+        yield
+        return
 
     def end_wait(number: int, frame: FrameType | None) -> None:
         del number, frame

@@ -49,6 +49,7 @@ from uavctl.errors import NotReachedError, UavctlError, in_words
 from uavctl.fleet.boxes import DOWNWASH
 from uavctl.fleet.coordinator import CellParameters
 from uavctl.flight.limits import AXES
+from uavctl.operating_system import check_flight_platform
 from uavctl.wiring.cells import Coordinator
 from uavctl.wiring.radio import RadioConfig, RadioLoad, compute_loads, compute_slot_ns
 
@@ -128,6 +129,7 @@ def fly(
     When one ends otherwise than it was asked to, the others are landed, too. Exit code: the largest of theirs.
     With `distance_m` all first come to rest in their cells. `coordinator.mcap` has each cycle of the coordinator.
     """
+    check_flight_platform()
     check_take_off(arm, takeoff)
     view_port = choose_live_port(live=live, port=live_port)
     fleet = read_fleet(file)

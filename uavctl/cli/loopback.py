@@ -56,6 +56,7 @@ from uavctl.flight.monitors.external import MAX_ANSWER_NS
 from uavctl.io.signed_connection import open_links
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
 from uavctl.loop import ControlLoop
+from uavctl.operating_system import check_flight_platform
 from uavctl.records import Sink, Truth
 from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 
@@ -84,6 +85,8 @@ def loopback(
     In virtual time the same seed gives the same flight, bit for bit. It begins in the air; with --arm --takeoff HEIGHT
     on the ground, and after its duration it ends there too.
     """
+    if udp:
+        check_flight_platform()
     take_off_m = check_take_off(arm, takeoff)
     view_port = choose_live_port(live=live, port=live_port)
     if live and not udp:

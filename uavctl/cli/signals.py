@@ -10,31 +10,23 @@ from types import FrameType
 
 from uavctl.errors import EndedBySignal
 
+
+def _list_signals(*names: str) -> frozenset[signal.Signals]:
+    """Return those of the signals that this operating system has."""
+    return frozenset(signal.Signals[name] for name in names if hasattr(signal, name))
+
+
 SIGNAL_EXIT_BASE = 128  # exit codes of a process that a signal has ended are this much higher than its number
 # Sent on purpose by a person or a service manager. Only the second one of these ends the process at once: a closed
 # terminal sends SIGHUP twice, and limits and timers repeat their signals.
-DELIBERATE = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGQUIT})
+DELIBERATE = _list_signals("SIGINT", "SIGTERM", "SIGQUIT")
 # Signals that do not kill, cannot be handled, or report a fault of the process itself.
-_EXCLUDED = frozenset(
-    {
-        signal.SIGKILL,
-        signal.SIGSTOP,
-        signal.SIGCHLD,
-        signal.SIGCONT,
-        signal.SIGTSTP,
-        signal.SIGTTIN,
-        signal.SIGTTOU,
-        signal.SIGURG,
-        signal.SIGWINCH,
-        signal.SIGSEGV,
-        signal.SIGBUS,
-        signal.SIGFPE,
-        signal.SIGILL,
-        signal.SIGABRT,
-    }
+_EXCLUDED = _list_signals(
+    *("SIGKILL", "SIGSTOP", "SIGCHLD", "SIGCONT", "SIGTSTP", "SIGTTIN", "SIGTTOU", "SIGURG", "SIGWINCH"),
+    *("SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT"),
 )
 # Signals of a terminal that stop a process; a stopped flight would send nothing, and hear no pilot.
-_STOPPING = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+_STOPPING = _list_signals("SIGTSTP", "SIGTTIN", "SIGTTOU")
 END_LIMIT_S = 10  # from the second signal to the end of the process; the recording closes within 5 s
 
 Handler = Callable[[int, FrameType | None], None]
@@ -81,8 +73,9 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
         if number not in DELIBERATE:
             return
         if deliberate_requested.is_set():
-            signal.signal(signal.SIGALRM, signal.SIG_DFL)
-            signal.alarm(END_LIMIT_S)
+            if hasattr(signal, "SIGALRM"):
+                signal.signal(signal.SIGALRM, signal.SIG_DFL)
+                signal.alarm(END_LIMIT_S)
             raise EndedBySignal(SIGNAL_EXIT_BASE + number)
         deliberate_requested.set()
 

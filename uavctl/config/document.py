@@ -21,6 +21,8 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import FieldInfo
 
+from uavctl.operating_system import O_BINARY, O_CLOEXEC, O_NONBLOCK
+
 
 class ConfigProblem(NamedTuple):
     """Key path, its error, and the remedy."""
@@ -164,7 +166,7 @@ def read_text(path: Path) -> str:
     """
     try:
         # A pipe without a writer opens at once this way.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | O_NONBLOCK | O_CLOEXEC | O_BINARY)
         with os.fdopen(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 raise DataFileError((f"{path}: cannot be read (Is a directory)",))

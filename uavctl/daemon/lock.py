@@ -11,7 +11,6 @@ recognised before they are opened.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import ipaddress
 import os
@@ -25,6 +24,7 @@ from urllib.parse import urlsplit
 
 from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
+from uavctl.operating_system import lock_file
 
 _MAX_BYTES = 500  # of a lock file that are read
 _MAX_TRIES = 10  # while the last holder removes the file
@@ -176,7 +176,7 @@ def _lock_file(path: Path, url: str) -> int:
                 f"{path}: {error.strerror}, so nothing shows that {url} is free; check the file and its folder"
             ) from error
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(descriptor)
         except BlockingIOError:
             taken_error = _make_taken_error(descriptor, url)
             os.close(descriptor)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -91,6 +90,8 @@ def _set_scheduler(priority: int) -> RealtimeSetting:
 
 def _lock_memory() -> RealtimeSetting:
     """Lock every used page in memory. Only without a limit: with one, a later allocation would fail."""
+    import resource
+
     _, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if hard != resource.RLIM_INFINITY and not _may_lock_memory():
         return RealtimeSetting(

@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from uavctl.errors import UsageError
+from uavctl.operating_system import check_flight_platform
 
 RUN = Path("/run")
 TEMPORARY = Path("/tmp")
@@ -35,7 +36,9 @@ def find_runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path,
 
     Raises:
         UsageError: there is none.
+        PlatformError: this operating system cannot fly.
     """
+    check_flight_platform()
     user_id = os.geteuid()
     xdg_folder = Path(environ.get("XDG_RUNTIME_DIR") or "/")
     bases = [base for base in (xdg_folder, RUN / "user" / str(user_id)) if base.is_absolute() and base != Path("/")]

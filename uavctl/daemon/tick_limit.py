@@ -23,7 +23,6 @@ LIMIT_S = 1.0  # 20 ticks; vehicles leave the external mode after 0.5 to 3 s wit
 # acceleration on for 0.7 s, which led out of a room of 6 m by 1.0 to 1.5 m.
 ENGAGED_LIMIT_S = MAX_ANSWER_NS * 1e-9
 _PERIOD_S = 0.05
-_SIGNAL = signal.SIGURG  # the only one that is ignored where nobody handles it, and that no timer sends
 
 
 class TickLimit:
@@ -66,7 +65,7 @@ class TickLimit:
             # The first wake may come right after the tick began.
             if self._is_running and (self._wakes - 1) * _PERIOD_S >= self._limit_s:
                 self._wakes = 0
-                signal.pthread_kill(thread, _SIGNAL)
+                signal.pthread_kill(thread, signal.SIGURG)
 
     def end(self) -> None:
         """End the watch."""
@@ -81,7 +80,8 @@ def limit_ticks(engaged_limit_s: float = LIMIT_S) -> Iterator[TickLimit]:
         engaged_limit_s: of a tick while the vehicle flies the setpoints [s].
     """
     limit, main_thread = TickLimit(engaged_limit_s), threading.main_thread()
-    previous = signal.signal(_SIGNAL, limit.handle_signal)
+    # The only signal that is ignored where nobody handles it, and that no timer sends.
+    previous = signal.signal(signal.SIGURG, limit.handle_signal)
     try:
         watcher = threading.Thread(target=limit.watch, args=(main_thread.ident,), name="tick limit", daemon=True)
         try:
@@ -95,4 +95,4 @@ def limit_ticks(engaged_limit_s: float = LIMIT_S) -> Iterator[TickLimit]:
             limit.end()
             watcher.join()
     finally:
-        signal.signal(_SIGNAL, previous)
+        signal.signal(signal.SIGURG, previous)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import socket
 import time
 from collections import Counter, deque
@@ -82,6 +81,8 @@ def serve_daemon(descriptor: int, memory_limit: int, run: Callable[[socket.socke
         descriptor: number of our end of the pair of sockets.
         memory_limit: addresses that the process may have [bytes].
     """
+    import resource
+
     resource.setrlimit(resource.RLIMIT_AS, (memory_limit, memory_limit))
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
     with socket.socket(fileno=descriptor) as pipe:

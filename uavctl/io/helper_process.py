@@ -10,6 +10,8 @@ import subprocess
 import sys
 from collections.abc import Sequence
 
+from uavctl.operating_system import check_flight_platform
+
 _END_S = 2.0  # for the process to end by itself
 MAX_RESTARTS = 3  # of a helper process that ends while it is needed
 
@@ -29,6 +31,7 @@ class HelperProcess:
 
     Raises:
         OSError: The system does not allow that now: no memory, no descriptor, or too many processes.
+        PlatformError: This operating system cannot fly.
     """
 
     def __init__(
@@ -39,6 +42,7 @@ class HelperProcess:
         descriptors: Sequence[int] = (),
         stderr: int | None = subprocess.DEVNULL,
     ) -> None:
+        check_flight_platform()
         self.socket, peer = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with peer:
             number = peer.fileno()

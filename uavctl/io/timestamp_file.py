@@ -6,7 +6,6 @@ is above all timestamps that a killed process has accepted or sent.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import threading
 import time
@@ -17,6 +16,7 @@ from typing import TextIO
 
 from uavctl.errors import KeyFileError
 from uavctl.mavlink.signing import MAX_TIMESTAMP, SigningTimestamps
+from uavctl.operating_system import O_CLOEXEC, lock_file, sync_folder
 
 WRITE_AHEAD = 200_000  # units of 10 µs: 2 s ahead of the newest timestamp
 RENEW_MARGIN = 100_000  # written again when less than this is left
@@ -75,16 +75,12 @@ def save_timestamp(path: Path, stamp: int) -> None:
             file.flush()
             os.fsync(file.fileno())
         draft.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(path.parent)
 
 
 def _open_private(path: Path, flags: int) -> TextIO:
     """Open a file for writing that no other user can open, made if need be."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | flags, 0o600)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | O_CLOEXEC | flags, 0o600)
     os.fchmod(descriptor, 0o600)
     return os.fdopen(descriptor, "w", encoding="ascii")
 
@@ -97,10 +93,10 @@ def _lock_file(lock: int) -> None:
     """
     for _ in range(LOCK_TRIES):
         with suppress(BlockingIOError):
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(lock)
             return
         time.sleep(LOCK_PAUSE_S)
-    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    lock_file(lock)
 
 
 class TimestampFile:

@@ -6,7 +6,6 @@ alone.
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -20,9 +19,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from logs.recording.replay import iterate_different_leaves
-from uavctl.errors import UavctlError, UsageError
+from uavctl.errors import PlatformError, UavctlError, UsageError
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import DOCUMENT, RUNS, SCHEMA, CampaignRecord, CellRecord, read_document
+from uavctl.operating_system import lock_file, sync_folder
 
 SPECIFICATION = "campaign.toml"
 # Columns that name the cell of each row, in either world, so that the table can be read alone.
@@ -182,9 +182,11 @@ def _trim_histograms(counts: NDArray[np.generic]) -> pa.ListArray:
 
 def _lock_folder(descriptor: int, folder: Path) -> None:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock_file(descriptor)
     except BlockingIOError as error:
         raise UsageError(f"{folder}: another process flies this campaign; wait for it") from error
+    except PlatformError:  # only the start of a second process on this folder goes unnoticed
+        return
 
 
 def _write_file(path: Path, data: bytes) -> None:
@@ -195,11 +197,7 @@ def _write_file(path: Path, data: bytes) -> None:
 
 def _rename_synced(draft: Path, path: Path) -> None:
     """Rename a temporary file once it is on the disk."""
-    for synced in (draft, path.parent):
-        if synced == path.parent:
-            draft.replace(path)
-        descriptor = os.open(synced, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    with draft.open("ab") as file:
+        os.fsync(file.fileno())
+    draft.replace(path)
+    sync_folder(path.parent)
