@@ -10,8 +10,9 @@ STAMP := $(VENV)/.installed
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
 CLIENTS := .venv-clients
 ROS2 := .venv-ros2
+LOWEST := .venv-lowest
 
-.PHONY: fly test test-all test-long test-manual test-clients test-ros2 mutation docs site clean
+.PHONY: fly test test-all test-long test-manual test-clients test-ros2 test-lowest mutation docs site clean
 
 fly: $(FLIES)
 	$(VENV)/bin/uavctl loopback --udp --config room
@@ -30,6 +31,11 @@ test-long: $(STAMP)
 # Types the commands of the manual's pages as a reader would, in real time, against simulated vehicles.
 test-manual: $(STAMP)
 	$(VENV)/bin/python -m pytest -n 2 --dist loadgroup -m manual tests/e2e/test_manual.py
+
+# The core, configurations, recordings and the Python API with the lowest versions that pyproject.toml permits.
+test-lowest: $(LOWEST)/.installed
+	$(LOWEST)/bin/python -m pytest -n 0 -m "not slow and not long" tests/smpc tests/flight tests/config tests/logs/recording \
+		tests/api/test_python_api.py
 
 test-clients: $(STAMP) $(CLIENTS)/.installed
 	UAVCTL_MAVSDK_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk/bin/python \
@@ -74,6 +80,13 @@ $(CLIENTS)/.installed: constraints-clients.txt
 	$(CLIENTS)/mavproxy/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-clients.txt pyserial pymavlink
 	touch $@
 
+$(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check setuptools wheel
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-lowest.txt --no-build-isolation \
+		-e '.[campaign,pandas,polars,ulog]' hypothesis pytest pytest-xdist
+	touch $@
+
 $(ROS2)/.installed: pyproject.toml constraints.txt constraints-ros2.txt
 	$(PYTHON) -m venv $(ROS2)
 	$(ROS2)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt setuptools wheel
@@ -82,4 +95,4 @@ $(ROS2)/.installed: pyproject.toml constraints.txt constraints-ros2.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) $(ROS2) build dist site *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) $(ROS2) $(LOWEST) build dist site *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

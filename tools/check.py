@@ -6,6 +6,7 @@ last two. `--write-docs` only writes the generated pages.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -14,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
@@ -34,6 +36,9 @@ MARKS = {"": "not slow and not long and not manual", "--all": "not long and not 
 # Profiles of Hypothesis (tests/conftest.py).
 PROFILES = {"": "quick", "--all": "patient", "--long": "patient"}
 
+# Limits of the wheel's check on another interpreter [s]: one program, and the installation of all packages.
+PROGRAM_S, INSTALL_S = 120.0, 300.0
+
 
 class StageError(Exception):
     """A stage failed; holds the output for the reader."""
@@ -45,23 +50,33 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
-def run(command: Sequence[str | Path], *, cwd: Path = ROOT, extra: Mapping[str, str] | None = None) -> str:
-    """Run a program to its end; its output.
+def run(
+    command: Sequence[str | Path],
+    *,
+    cwd: Path = ROOT,
+    extra: Mapping[str, str] | None = None,
+    limit_s: float | None = None,
+) -> str:
+    """Run a program to its end, for `limit_s` at most; its output.
 
     Raises:
-        StageError: If it exits with anything but 0, with all its output.
+        StageError: If it exits with anything but 0, with all its output, or takes longer.
     """
     words = [str(word) for word in command]
-    done = subprocess.run(
-        words,
-        cwd=cwd,
-        env={**os.environ, **_PROCESSES, **(extra or {})},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        check=False,
-    )
+    try:
+        done = subprocess.run(
+            words,
+            cwd=cwd,
+            env={**os.environ, **_PROCESSES, **(extra or {})},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+            timeout=limit_s,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise StageError(f"{' '.join(words)}: not done within {limit_s:g} s") from error
     if done.returncode != 0:
         raise StageError(f"{done.stdout}\n{' '.join(words)}: exit code {done.returncode}")
     return done.stdout
@@ -75,8 +90,49 @@ def check_pages() -> str:
     return ""
 
 
+def find_interpreters() -> dict[str, Path]:
+    """Find an interpreter of each version that pyproject.toml names, except this one's, on PATH and below pyenv."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = [classifier.rpartition(" ")[2] for classifier in project["classifiers"] if ":: Python ::" in classifier]
+    pyenv = Path(os.environ.get("PYENV_ROOT", "~/.pyenv")).expanduser() / "versions"
+    found = {}
+    for version in named:
+        if version == f"{sys.version_info[0]}.{sys.version_info[1]}":
+            continue
+        on_path = shutil.which(f"python{version}")
+        candidates = [*([Path(on_path)] if on_path else []), *sorted(pyenv.glob(f"{version}.*/bin/python{version}"))]
+        for candidate in candidates:
+            # A name on PATH may be pyenv's own, which fails where that version is not chosen.
+            with contextlib.suppress(StageError):
+                run([candidate, "-c", "import venv"], limit_s=PROGRAM_S)
+                found[version] = candidate
+                break
+    return found
+
+
+def check_interpreter(python: Path, wheel: Path, folder: Path, recording: Path) -> None:
+    """Install the wheel in an environment of its own; fly there, and replay another interpreter's recording.
+
+    With the same versions of all packages a replay decides the same to the last bit.
+    """
+    environment, flights = folder / "environment", folder / "flights"
+    folder.mkdir()
+    run([python, "-m", "venv", environment], limit_s=PROGRAM_S)
+    pip = (environment / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
+    run([*pip, "-c", ROOT / "constraints.txt", wheel], cwd=folder, limit_s=INSTALL_S)
+    uavctl = environment / "bin" / "uavctl"
+    for words in (
+        ("--version",),
+        ("loopback", "--config", "room", "--duration", "5", "--out", str(flights)),
+        ("log", "replay", str(recording)),
+    ):
+        run([uavctl, *words], cwd=folder, limit_s=PROGRAM_S)
+    script = "import uavctl; print(uavctl.solve('room', [0.0] * 9).cost, uavctl.read('flights/flight.mcap').topics)"
+    run([environment / "bin" / "python", "-W", "error", "-c", script], cwd=folder, limit_s=PROGRAM_S)
+
+
 def check_wheel() -> str:
-    """Build the wheel, install it outside the checkout, and fly from there."""
+    """Build the wheel, install it outside the checkout for each interpreter of this machine, and fly from there."""
     with tempfile.TemporaryDirectory(prefix="uavctl-wheel-") as name:
         folder = Path(name)
         shutil.rmtree(ROOT / "build", ignore_errors=True)  # else modules that are gone would be in the wheel
@@ -96,6 +152,9 @@ def check_wheel() -> str:
         output = run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
         if not any((folder / "flights").glob("*.html")):
             raise StageError(f"{output}\nthe wheel made no page of its flight")
+        for version, python in find_interpreters().items():
+            check_interpreter(python, wheel, folder / version, folder / "flights" / "flight.mcap")
+            say(f"    wheel on Python {version}")
         return output
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import struct
 from contextlib import nullcontext
+from inspect import signature
 from pathlib import Path
 
 import pytest
@@ -32,7 +33,8 @@ def test_the_format_s_own_readers_take_it(tmp_path: Path) -> None:
         seeking = make_reader(file, validate_crcs=True)
         summary = seeking.get_summary()
         by_time = [(channel.topic, message.log_time, message.data) for _, channel, message in seeking.iter_messages()]
-        some = list(seeking.iter_messages(topics=["/uavctl/setpoint"], starting_at=1_500_000_000))
+        begin = "starting_at" if "starting_at" in signature(seeking.iter_messages).parameters else "start_time"  # < 1.6
+        some = list(seeking.iter_messages(topics=["/uavctl/setpoint"], **{begin: 1_500_000_000}))
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == len(by_time) == count + 2  # and two notes
