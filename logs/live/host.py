@@ -1,6 +1,6 @@
 """Process of a live view, which the flight starts as `python -m logs.live.host FEED LISTENER`.
 
-1. Take the flight's messages from FEED, the number of a socket; the first is the token.
+1. Take the flight's messages from FEED, the number of a socket; the first is a `LiveAccess`.
 2. Serve them on LISTENER, the number of a listening socket.
 3. End when the flight has closed its end, or has died.
 """
@@ -17,14 +17,18 @@ from pathlib import Path
 import msgspec
 
 from logs.live.feed import LARGEST, SCENE, unpack
-from logs.live.scene import FlightScene
+from logs.live.history import History
+from logs.live.request import LiveAccess
+from logs.live.scene import FlightScene, LiveScene, add_scene
 from logs.live.server import LiveServer
 from logs.recording.topics import decode, get_definition, is_view
 from uavctl.errors import RecordingError
 
 _MAX_READS = 64  # messages that are taken before clients are served again
 _NICENESS = 19  # the flight and all that it needs come first
+_ORDER_NICENESS = 10  # lower, orders would not come through on a busy computer
 _DESCRIPTOR_LIMIT = 128  # several times the server's own limits
+_SCENES = msgspec.json.Decoder(LiveScene)
 _OOM_SCORE = Path("/proc/self/oom_score_adj")
 
 
@@ -33,14 +37,15 @@ class LiveHost:
 
     Args:
         feed: This process's end of the pair of sockets.
-        token: See `LiveServer`.
+        access: See `LiveServer`.
     """
 
-    def __init__(self, feed: socket.socket, token: str) -> None:
+    def __init__(self, feed: socket.socket, access: LiveAccess) -> None:
         self._feed = feed
-        self._flight = FlightScene()
-        self._scene: bytes | None = None  # of a simulator
-        self._server = LiveServer(self._get_scene, token)
+        self._history = History()
+        self._flight = FlightScene(self._history)
+        self._scene: bytes | None = None  # of a simulator, or a fleet
+        self._server = LiveServer(self._get_scene, self._history.encode, access)
         self._buffer = bytearray(LARGEST)
 
     async def run(self, listener: socket.socket) -> None:
@@ -74,6 +79,8 @@ class LiveHost:
     def _take(self, topic: str, at_ns: int, data: bytes) -> None:
         if topic == SCENE:
             self._scene = data
+            with suppress(msgspec.MsgspecError):
+                add_scene(self._history, _SCENES.decode(data))
             return
         if not is_view(topic):
             with suppress(RecordingError):
@@ -90,15 +97,15 @@ def main(arguments: list[str]) -> int:
 
     feed_number, listener_number = map(int, arguments)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
-    os.nice(_NICENESS)
     resource.setrlimit(resource.RLIMIT_NOFILE, (_DESCRIPTOR_LIMIT, _DESCRIPTOR_LIMIT))
     with suppress(OSError):  # not every container permits it
         _OOM_SCORE.write_text("1000")  # a computer without memory ends this process first
     with socket.socket(fileno=feed_number) as feed, socket.socket(fileno=listener_number) as listener:
-        token = feed.recv(LARGEST).decode()
+        access = msgspec.json.decode(feed.recv(LARGEST), type=LiveAccess)
+        os.nice(_ORDER_NICENESS if access.sockets else _NICENESS)
         feed.setblocking(False)
         listener.setblocking(False)
-        asyncio.run(LiveHost(feed, token).run(listener))
+        asyncio.run(LiveHost(feed, access).run(listener))
     return 0
 
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 import secrets
 import socket
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import msgspec
 
 from logs.live.feed_process import FeedProcess
+from logs.live.request import LiveAccess
 from uavctl.errors import UsageError
 from uavctl.io.helper_process import HelperProcess
 
@@ -45,10 +49,12 @@ class LiveProcess(FeedProcess):
 
     Args:
         port: TCP port; 0 takes one that is free.
+        sockets: Control socket by name of the vehicle, for pages with the token; empty: no orders are taken.
 
     Attributes:
         port: Port that is served.
         token: Path with which pages of other sites may open the WebSocket.
+        order_token: Token of pages that may give orders.
 
     Raises:
         UsageError: The port cannot be had, or the process cannot be started.
@@ -56,9 +62,16 @@ class LiveProcess(FeedProcess):
 
     name = "live view"
 
-    def __init__(self, port: int, on_death: Callable[[str], None]) -> None:
+    def __init__(self, port: int, on_death: Callable[[str], None], sockets: Mapping[str, Path] | None = None) -> None:
         self.token, self.port = secrets.token_urlsafe(12), port
+        self.order_token = secrets.token_urlsafe(16)
+        self._sockets = {name: str(path) for name, path in (sockets or {}).items()}
         super().__init__(on_death)
+
+    @property
+    def page_url(self) -> str:
+        """Address of the page; its fragment, which a browser sends to nobody, permits orders."""
+        return f"http://localhost:{self.port}/{f'#{self.order_token}' if self._sockets else ''}"
 
     def _make_helper(self) -> HelperProcess:
         with open_port(self.port) as listener:
@@ -67,4 +80,5 @@ class LiveProcess(FeedProcess):
             return HelperProcess("logs.live.host", [str(number)], descriptors=(number,), stderr=subprocess.PIPE)
 
     def _list_first_words(self) -> list[bytes]:
-        return [self.token.encode()]  # other users can read the arguments of a process
+        # Other users can read the arguments of a process
+        return [msgspec.json.encode(LiveAccess(self.token, self.order_token, self._sockets))]

@@ -9,9 +9,10 @@ from typing import Literal, TypeVar
 
 import msgspec
 
+from logs.live.history import History
 from logs.recording.derived_topics import tighten_limits
-from logs.recording.design_view import AXIS_NUMBER, DesignView, get_config_name, read_design
-from uavctl.arrays import Array
+from logs.recording.design_view import AXIS_NUMBER, DesignView, get_config_name, get_position_rate_hz, read_design
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.errors import RecordingError
 from uavctl.records import (
     ControlMode,
@@ -34,6 +35,7 @@ MOST_EVENTS = 12
 R = TypeVar("R", bound=Record)
 Level = Literal["good", "warn", "bad", "plain"]
 _LEVELS: dict[Severity, Level] = {Severity.INFO: "plain", Severity.WARNING: "warn", Severity.ERROR: "bad"}
+_LOSS_PERIODS = 10  # seconds over which losses are counted
 _IN_CONTROL = frozenset({ControlMode.WAIT, ControlMode.TRACK})
 
 
@@ -100,10 +102,22 @@ class LiveScene(msgspec.Struct, frozen=True):
     vehicles: tuple[SceneVehicle, ...] = ()  # of a fleet
 
 
-class FlightScene:
-    """Keeps the newest record of each kind."""
+def add_scene(history: History, scene: LiveScene) -> None:
+    """Add a scene to a history: all vehicles and bodies that have a place."""
+    places_m = {body.name: body.at_m for body in scene.bodies}
+    places_m |= {vehicle.name: vehicle.at_m for vehicle in scene.vehicles if vehicle.at_m is not None}
+    history.add(scene.time_s, scene.age_s, places_m)
 
-    def __init__(self) -> None:
+
+class FlightScene:
+    """Keeps the newest record of each kind.
+
+    Args:
+        history: Gets the state of each tick; None: it is not kept.
+    """
+
+    def __init__(self, history: History | None = None) -> None:
+        self._history, self._loss_meter = history, _LossMeter()
         self._newest: dict[type[Record], Record] = {}
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._design: DesignView | None = None
@@ -120,22 +134,22 @@ class FlightScene:
                 self._design = read_design(record)
             except RecordingError:
                 self._design = None  # the page then draws no limits
+            self._loss_meter = _LossMeter(get_position_rate_hz(record))
+        elif isinstance(record, Decision):
+            self._loss_meter.add(record)
+            header = self._get(Header)
+            if header is not None and self._history is not None:
+                places_m = {body.name: body.at_m for body in self._list_bodies(record)}
+                self._history.add((record.at_ns - header.started_ns) * 1e-9, self._get_age_s(), places_m)
 
     def scene(self) -> LiveScene | None:
         """Return the scene of the newest records; None before the first decision."""
         decision, design = self._get(Decision), self._design
-        header, estimate, plan, truth = self._get(Header), self._get(Estimate), self._get(Plan), self._get(Truth)
+        header, plan = self._get(Header), self._get(Plan)
         if decision is None or header is None:
             return None
-        age_s = None if estimate is None else max(0.0, estimate.age_s)
+        age_s = self._get_age_s()
         limit_s = None if design is None else design.horizon * design.dt_s
-        bodies = []
-        if estimate is not None and design is not None:
-            level: Level = "good" if decision.news else "warn"
-            position = design.position_of(estimate.mean)
-            bodies.append(SceneBody("estimate", position, level if decision.mode in _IN_CONTROL else "bad"))
-        if truth is not None:
-            bodies.append(SceneBody("truth", truth.position_m, "plain"))
         current = plan if plan is not None and plan.seq == decision.plan_seq else None
         level = _get_level(decision, age_s, limit_s)
         return LiveScene(
@@ -143,7 +157,7 @@ class FlightScene:
             time_s=(decision.at_ns - header.started_ns) * 1e-9,
             headline=_make_headline(decision, age_s),
             level=level,
-            bodies=tuple(bodies),
+            bodies=tuple(self._list_bodies(decision)),
             plan=() if current is None or design is None else _list_positions(design, current),
             target_m=None if decision.target is None or design is None else design.position_of(decision.target),
             box=None if design is None else _make_box(design, design.state_box.lower, design.state_box.upper),
@@ -159,7 +173,30 @@ class FlightScene:
             ),
         )
 
+    def _get_age_s(self) -> float | None:
+        estimate = self._get(Estimate)
+        return None if estimate is None else max(0.0, estimate.age_s)
+
+    def _list_bodies(self, decision: Decision) -> Iterator[SceneBody]:
+        estimate, truth = self._get(Estimate), self._get(Truth)
+        if estimate is not None and self._design is not None:
+            level: Level = "good" if decision.news else "warn"
+            position_m = self._design.position_of(estimate.mean)
+            yield SceneBody("estimate", position_m, level if decision.mode in _IN_CONTROL else "bad")
+        if truth is not None:
+            yield SceneBody("truth", truth.position_m, "plain")
+
+    def _list_state_figures(self) -> Iterator[SceneFigure]:
+        """List position, age of information and lost positions."""
+        estimate, age_s, loss = self._get(Estimate), self._get_age_s(), self._loss_meter.loss
+        if estimate is not None and self._design is not None:
+            place_text = ", ".join(f"{value:+z.2f}" for value in self._design.position_of(estimate.mean))
+            yield SceneFigure("position N, E, D [m]", place_text)
+        yield SceneFigure("age of information", "no position yet" if age_s is None else f"{age_s:.2f} s")
+        yield SceneFigure("positions lost in the last 10 s", "-" if loss is None else f"{loss:.0%}")
+
     def _list_figures(self, decision: Decision, plan: Plan | None) -> Iterator[SceneFigure]:
+        yield from self._list_state_figures()
         vehicle, setpoint = self._get(VehicleStatus), self._get(Setpoint)
         link, timing = self._get(LinkEstimate), self._get(Timing)
         if vehicle is None:
@@ -188,6 +225,32 @@ class FlightScene:
     def _get(self, kind: type[R]) -> R | None:
         record = self._newest.get(kind)
         return record if isinstance(record, kind) else None
+
+
+class _LossMeter:
+    """Share of the expected positions that did not come in the last ten seconds, as `uavctl ctl status` counts it.
+
+    Args:
+        rate_hz: Positions that are expected [1/s].
+    """
+
+    def __init__(self, rate_hz: float | None = None) -> None:
+        self._rate_hz, self._count = rate_hz, 0
+        self._counts: deque[tuple[int, int]] = deque(maxlen=_LOSS_PERIODS + 1)  # at_ns, positions; one a second
+        self.loss: float | None = None  # None in the first second
+
+    def add(self, decision: Decision) -> None:
+        """Count the positions of a tick."""
+        if not self._counts:
+            self._counts.append((decision.at_ns, 0))
+        self._count += decision.accepted + decision.rejected
+        if decision.at_ns - self._counts[-1][0] < SECOND_NS:
+            return
+        if self._rate_hz:
+            before_ns, before = self._counts[0]
+            expected = self._rate_hz * (decision.at_ns - before_ns) / SECOND_NS
+            self.loss = max(0.0, 1.0 - (self._count - before) / expected)
+        self._counts.append((decision.at_ns, self._count))
 
 
 def _make_headline(decision: Decision, age_s: float | None) -> str:

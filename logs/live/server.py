@@ -1,4 +1,4 @@
-"""Server of the live view: the page, its states one after another, and Foxglove's WebSocket, on one port.
+"""Server of the live view: the page, its states one after another, its orders, and Foxglove's WebSocket, on one port.
 
 All that a client can take up is bounded: connections, their rate, time and size of a request, and what waits for it.
 """
@@ -12,8 +12,20 @@ from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 
+import msgspec
+
 from logs.live.foxglove import SUBPROTOCOLS, Subscriber, make_advertisement, make_server_info
-from logs.live.request import Request, RequestRefusedError, check_request, parse_request
+from logs.live.orders import OrderSender
+from logs.live.request import (
+    HISTORY,
+    ORDERS,
+    LiveAccess,
+    Request,
+    RequestRefusedError,
+    check_request,
+    may_order,
+    parse_request,
+)
 from logs.live.websocket import Opcode, WebSocketError, make_frame, make_handshake, read_frame
 from logs.recording.topics import Definition
 
@@ -24,6 +36,7 @@ ACCEPT_PERIOD_S = 0.005  # between two connections: a flood costs little time of
 REQUEST_PERIOD_S = 0.01  # between two requests of a viewer, likewise
 PATIENCE_S = 5.0  # for a request, and for a client that takes nothing
 MAX_HEAD_BYTES = 8192  # of a request; browsers send less than 1 kB
+_JSON = "application/json"
 _FILES = {
     "/": (Path(__file__).with_name("page.html"), "text/html; charset=utf-8"),
     "/live.js": (Path(__file__).with_name("page.js"), "text/javascript; charset=utf-8"),
@@ -35,11 +48,13 @@ class LiveServer:
 
     Args:
         get_scene: Returns the newest scene, as JSON.
-        token: Path by which pages of other sites may open the WebSocket.
+        get_history: Returns the states since the start, as JSON.
+        access: What it permits, and to whom.
     """
 
-    def __init__(self, get_scene: Callable[[], bytes], token: str) -> None:
-        self._get_scene, self._token = get_scene, token
+    def __init__(self, get_scene: Callable[[], bytes], get_history: Callable[[], bytes], access: LiveAccess) -> None:
+        self._get_scene, self._get_history, self._access = get_scene, get_history, access
+        self._orders = OrderSender(access.sockets)
         self._channels: dict[str, int] = {}  # number by topic, from 1
         self._definitions: list[Definition] = []
         self._subscribers: dict[Subscriber, asyncio.Event] = {}
@@ -103,21 +118,24 @@ class LiveServer:
                 HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, f"a request has at most {MAX_HEAD_BYTES} bytes"
             ) from None
         request = parse_request(head)
-        check_request(request, self._token)
+        check_request(request, self._access)
         return request
 
     async def _answer(self, request: Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if not request.asks_for_websocket and request.path in _FILES:
             path, kind = _FILES[request.path]
-            data = path.read_bytes()
-            await _send(writer, _make_head(HTTPStatus.OK, kind, len(data)) + data)
+            await _send_document(writer, kind, path.read_bytes())
+            return
+        if request.path == HISTORY:
+            await _send_document(writer, _JSON, self._get_history())
+            return
+        if request.path == ORDERS:
+            await self._answer_orders(request, reader, writer)
             return
         if self._viewers >= MAX_VIEWERS:
             raise RequestRefusedError(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_VIEWERS} viewers are connected")
         handshake = make_handshake(request, SUBPROTOCOLS) if request.asks_for_websocket else b""
-        task = asyncio.current_task()
-        if task is not None:
-            self._asking.pop(task, None)
+        self._keep_connection()
         self._viewers += 1
         try:
             if handshake:
@@ -127,6 +145,26 @@ class LiveServer:
                 await self._send_scenes(writer)
         finally:
             self._viewers -= 1
+
+    def _keep_connection(self) -> None:
+        """Keep this connection where newer ones end the oldest whose request is not answered."""
+        task = asyncio.current_task()
+        if task is not None:
+            self._asking.pop(task, None)
+
+    async def _answer_orders(
+        self, request: Request, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """List the vehicles that take orders, or pass an order on."""
+        answer: object
+        if request.method == "POST":
+            self._keep_connection()
+            async with asyncio.timeout(PATIENCE_S):
+                body = await reader.readexactly(int(request.headers["content-length"]))
+            answer = await self._orders.give(body)
+        else:
+            answer = {"vehicles": self._orders.vehicles, "permitted": may_order(request, self._access)}
+        await _send_document(writer, _JSON, msgspec.json.encode(answer))
 
     async def _send_scenes(self, writer: asyncio.StreamWriter) -> None:
         await _send(writer, _make_head(HTTPStatus.OK, "text/event-stream"))
@@ -193,13 +231,18 @@ async def _send(writer: asyncio.StreamWriter, data: bytes) -> None:
         await writer.drain()
 
 
+async def _send_document(writer: asyncio.StreamWriter, kind: str, data: bytes) -> None:
+    """Send a whole answer; raises as `_send`."""
+    await _send(writer, _make_head(HTTPStatus.OK, kind, len(data)) + data)
+
+
 def _make_head(status: HTTPStatus, kind: str, length: int | None = None) -> bytes:
     """Return the head of an answer, after which the connection is closed."""
     lines = [
         f"HTTP/1.1 {status.value} {status.phrase}",
         f"Content-Type: {kind}",
         "Cache-Control: no-store",
-        "Content-Security-Policy: default-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'",
+        "Content-Security-Policy: default-src 'self'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'none'",
         "X-Content-Type-Options: nosniff",
         "Connection: close",
     ]

@@ -194,6 +194,16 @@ def _get_free_input(header: Header) -> float:
     return float(estimator.get("bias_max", 0.0))
 
 
+def get_position_rate_hz(header: Header) -> float | None:
+    """Return the rate of positions that a flight counts on [1/s]; None if its configuration does not tell one."""
+    try:
+        config = parse_recorded_config(header.config_toml)
+        rate_hz = config.get("source", {}).get("rate_hz") or 1.0 / config["plant"]["dt_s"]
+    except (ConfigError, KeyError, TypeError, ZeroDivisionError):
+        return None
+    return float(rate_hz)
+
+
 def get_config_name(header: Header) -> str | None:
     """Return the name in a recording's configuration; None if there is none, or the TOML is damaged."""
     try:

@@ -6,6 +6,7 @@ import json
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -200,7 +201,10 @@ def read_scene(port: int) -> dict[str, Any]:
 def test_one_page_shows_all_and_refuses_other_sites_and_writing() -> None:
     places: list[Vec3] = [(0.0, -1.0, -1.0), (0.0, 1.0, -1.0)]
     *ports, page_port = choose_ports(3)
-    vehicles = [ShownVehicle(f"v{i}", port, lambda: None, lambda: None) for i, port in enumerate(ports)]
+    vehicles = [
+        ShownVehicle(f"v{i}", port, Path(f"/nobody/v{i}.sock"), lambda: None, lambda: None)
+        for i, port in enumerate(ports)
+    ]
     with ExitStack() as stack:
         for port, place_m in zip(ports, places, strict=True):
             stack.enter_context(serve_scene(port, make_scene(place_m)))
@@ -219,6 +223,10 @@ def test_one_page_shows_all_and_refuses_other_sites_and_writing() -> None:
             ({"Host": "localhost"}, "POST", 405),
         ):
             assert ask(page_port, make_head(headers, "/scenes", method))[0] == refused_status
+        offer = json.loads(ask(page_port, make_head({"Host": "localhost"}, "/orders"))[1])
+        assert offer == {"vehicles": ["v0", "v1"], "permitted": False}
+        samples = json.loads(ask(page_port, make_head({"Host": "localhost"}, "/history"))[1])["samples"]
+        assert samples[-1][3] == {f"v{i}": list(place_m) for i, place_m in enumerate(places)}
 
 
 def test_a_taken_port_is_refused_before_anything_flies() -> None:

@@ -216,10 +216,12 @@ def _open_page(
     if live_port is None:
         yield
         return
+    folder = find_control_folder(None)
     vehicles = [
         ShownVehicle(
             flight.member.name,
             port,
+            make_socket_path(folder, flight.member.daemon),
             partial(health_by_name.get, flight.member.name),
             partial(getattr, flight, "exit_code"),
         )

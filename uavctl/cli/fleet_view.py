@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -39,6 +40,7 @@ class ShownVehicle:
 
     name: str
     port: int
+    socket: Path  # control socket of its daemon
     get_health: Callable[[], Health | None]
     get_exit_code: Callable[[], int | None]
 
@@ -65,11 +67,12 @@ def show_fleet_page(title: str, live_port: int, vehicles: Sequence[ShownVehicle]
     from logs.live.client import SceneReader  # loaded only for a view
     from logs.live.process import LiveProcess
 
-    live, done = LiveProcess(live_port, report_dead_view), threading.Event()
+    sockets = {vehicle.name: vehicle.socket for vehicle in vehicles}
+    live, done = LiveProcess(live_port, report_dead_view, sockets), threading.Event()
     readers = [SceneReader(vehicle.port) for vehicle in vehicles]
     rows = list(zip(vehicles, readers, strict=True))
     thread = threading.Thread(target=_feed_page, args=(live, title, rows, done), name="live page", daemon=True)
-    print_message(f"live page of the fleet: http://localhost:{live.port}/")
+    print_message(f"live page of the fleet: {live.page_url}")
     thread.start()
     try:
         yield

@@ -38,7 +38,7 @@ from uavctl.cli.signals import ignore_stopping_signals, stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import LoadedConfig
 from uavctl.config.connections import find_security_warnings
-from uavctl.daemon.control_socket import find_control_folder, make_daemon_name, open_listener
+from uavctl.daemon.control_socket import find_control_folder, make_daemon_name, make_socket_path, open_listener
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.flight_orders import FlightOrders, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.landing_guard import guard_landing
@@ -154,7 +154,7 @@ def fly_daemon(
     with (
         lock_vehicle(config.daemon.vehicle) as vehicle_lock,
         open_listener(folder, name) as listener,
-        open_viewers(view_port, ros2_choice) as viewers,
+        open_viewers(view_port, ros2_choice, {config.name: make_socket_path(folder, name)}) as viewers,
         create_recording(out, config.name, config.log) as path,
     ):
         with locate_design_errors(loaded):

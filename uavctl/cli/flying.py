@@ -6,7 +6,7 @@ import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from traceback import format_exc
@@ -120,12 +120,15 @@ class Ros2Choice(NamedTuple):
 
 
 @contextmanager
-def open_viewers(live_port: int | None = None, ros2: Ros2Choice | None = None) -> Iterator[DerivedTopics]:
+def open_viewers(
+    live_port: int | None = None, ros2: Ros2Choice | None = None, sockets: Mapping[str, Path] | None = None
+) -> Iterator[DerivedTopics]:
     """Open the viewers of a flight: views in its recording, a live view and a node of ROS 2 in processes of their own.
 
     Args:
         live_port: TCP port of the live view; 0: any free one; None: no live view.
         ros2: Node of ROS 2; None: no node.
+        sockets: Control socket by name of the vehicle, for orders of the live view's page; None: it gives none.
 
     Raises:
         UsageError: The live view or the node cannot be opened.
@@ -135,10 +138,10 @@ def open_viewers(live_port: int | None = None, ros2: Ros2Choice | None = None) -
         if live_port is not None:
             from logs.live.process import LiveProcess  # loaded only for a live view
 
-            live = LiveProcess(live_port, report_dead_view)
+            live = LiveProcess(live_port, report_dead_view, sockets)
             stack.callback(live.close)
             processes.append(live)
-            print_message(f"live page: http://localhost:{live.port}/")
+            print_message(f"live page: {live.page_url}")
             print_message(f'for Foxglove: ws://localhost:{live.port}/{live.token} ("Open connection")')
         if ros2 is not None:
             from uavctl.cli.ros2_process import Ros2Process  # loaded only for a node

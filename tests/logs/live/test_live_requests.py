@@ -5,16 +5,19 @@ from __future__ import annotations
 import asyncio
 from contextlib import suppress
 from http import HTTPStatus
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from live_rig import HANDSHAKE, make_head
 
-from logs.live.request import RequestRefusedError, check_request, parse_request
+from logs.live.request import MAX_BODY_BYTES, LiveAccess, RequestRefusedError, check_request, parse_request
 from logs.live.websocket import LARGEST, Opcode, WebSocketError, make_handshake, read_frame
 
-TOKEN = "t0ken"
+TOKEN, ORDER_TOKEN = "t0ken", "0rder"
+VIEW = LiveAccess(TOKEN, ORDER_TOKEN)  # of a flight that takes no orders
+ORDERS = LiveAccess(TOKEN, ORDER_TOKEN, {"one": "/run/one.sock"})
 FOREIGN = "https://flights.example"
 
 
@@ -23,7 +26,7 @@ def check(**changes: str) -> HTTPStatus:
     path, method = changes.pop("path", "/"), changes.pop("method", "GET")
     headers = {"Host": "localhost:8765", **changes}
     try:
-        check_request(parse_request(make_head(headers, path, method)), TOKEN)
+        check_request(parse_request(make_head(headers, path, method)), VIEW)
     except RequestRefusedError as refused:
         return refused.status
     return HTTPStatus.OK
@@ -58,7 +61,7 @@ def test_98_only_this_machine_s_names_are_a_host(host: str, status: int) -> None
 def test_98_a_host_that_comes_twice_is_none() -> None:
     head = b"GET / HTTP/1.1\r\nHost: localhost\r\nhost: localhost\r\n\r\n"
     with pytest.raises(RequestRefusedError) as refused:
-        check_request(parse_request(head), TOKEN)
+        check_request(parse_request(head), VIEW)
     assert refused.value.status == 403
 
 
@@ -108,12 +111,77 @@ def test_98_nothing_but_get_is_allowed(method: str) -> None:
     assert check(**HANDSHAKE, method=method, path=f"/{TOKEN}") == 405
 
 
+ORDER = {
+    "Host": "localhost:8765",
+    "Origin": "http://localhost:8765",
+    "X-Uavctl-Token": ORDER_TOKEN,
+    "Content-Type": "application/json",
+    "Content-Length": "2",
+}
+
+
+def check_order(access: LiveAccess = ORDERS, path: str = "/orders", **changes: str | None) -> int:
+    """The status of an order: a browser's from the page, with other headers, or without one."""
+    headers = {**ORDER, **{name.replace("_", "-"): value for name, value in changes.items()}}
+    try:
+        check_request(
+            parse_request(make_head({n: v for n, v in headers.items() if v is not None}, path, "POST")), access
+        )
+    except RequestRefusedError as refused:
+        return refused.status
+    return 200
+
+
+@pytest.mark.fault(98)
+@pytest.mark.parametrize(
+    ("changes", "status"),
+    [
+        ({}, 200),
+        ({"Sec_Fetch_Site": "same-origin"}, 200),
+        ({"Host": "127.0.0.1:8765", "Origin": "http://127.0.0.1:8765"}, 200),
+        ({"Host": "flights.example:8765", "Origin": "http://flights.example:8765"}, 403),  # its name leads here
+        ({"Origin": FOREIGN}, 403),
+        ({"Origin": "http://localhost:8080"}, 403),
+        ({"Origin": "http://127.0.0.1:8765"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Origin": None}, 403),
+        ({"Sec_Fetch_Site": "same-site"}, 403),
+        ({"Sec_Fetch_Site": "cross-site"}, 403),
+        ({"Sec_Fetch_Site": "none"}, 403),
+        ({"X_Uavctl_Token": None}, 403),
+        ({"X_Uavctl_Token": ""}, 403),
+        ({"X_Uavctl_Token": TOKEN}, 403),  # the token that Foxglove gets
+        ({"X_Uavctl_Token": f"{ORDER_TOKEN}x"}, 403),
+        ({"X_Uavctl_Token": ORDER_TOKEN[:-1]}, 403),
+        ({"X_Uavctl_Token": f"{ORDER_TOKEN}, {ORDER_TOKEN}"}, 403),
+        ({"Content_Type": "text/plain"}, 415),  # a form may send this without a question before
+        ({"Content_Type": None}, 415),
+        ({"Content_Length": None}, 411),
+        ({"Content_Length": "-1"}, 411),
+        ({"Content_Length": "2, 2"}, 411),
+        ({"Transfer_Encoding": "chunked"}, 411),
+        ({"Content_Length": str(MAX_BODY_BYTES + 1)}, 413),
+        ({"path": "/"}, 405),
+        ({"path": "/orders?"}, 405),
+        ({"path": "/scenes"}, 405),
+        ({"access": VIEW}, 405),
+    ],
+)
+def test_98_an_order_comes_from_the_page_itself_with_its_token(changes: Any, status: int) -> None:
+    assert check_order(**changes) == status
+
+
+@pytest.mark.fault(98)
+def test_98_without_a_secret_nobody_may_order() -> None:
+    assert check_order(LiveAccess(TOKEN, "", ORDERS.sockets), X_Uavctl_Token="") == 403
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_request_or_refused(data: bytes) -> None:
     for head in (data, b"GET / HTTP/1.1\r\n" + data, make_head({"Host": "localhost"})[:-2] + data):
         try:
             request = parse_request(head + b"\r\n\r\n")
-            check_request(request, TOKEN)
+            check_request(request, VIEW)
             make_handshake(request, ("foxglove.sdk.v1",))
         except RequestRefusedError as refused:
             assert 400 <= refused.status < 500
