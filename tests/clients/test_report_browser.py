@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import os
-import shutil
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from browser_rig import Browser
 from sender_recordings import open_sender_recording
 
 from logs.recording.flight import FlightData
@@ -24,7 +20,6 @@ from uavctl.lab.lockstep import fly_fleet
 from uavctl.wiring.controller import build_flight_design, prepare
 
 LIMIT_S = 60.0
-NAMES = ("chromium", "chromium-browser", "google-chrome")
 WIDTHS = (390, 500, 800, 1400)
 PAPER = 690  # pixels between the margins of A4
 # Measures the page from inside. Texts of one figure must not lie on each other, nor reach beyond it; what scrolls
@@ -55,82 +50,12 @@ return {
 """
 
 
-class Browser:
-    """A headless browser, told what to do by the DevTools protocol over pipes."""
-
-    def __init__(self, folder: Path) -> None:
-        (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
-        # The browser reads from descriptor 3 and writes to 4. (Some shells know no descriptor above 9.)
-        self._process = subprocess.Popen(
-            ["bash", "-c", f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}', browser(), "--headless", "--no-sandbox",
-             "--disable-gpu", "--hide-scrollbars", "--remote-debugging-pipe", f"--user-data-dir={folder}"],
-            pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        os.close(theirs_in)
-        os.close(theirs_out)
-        self._out, self._in = os.fdopen(ours_out, "wb", 0), os.fdopen(ours_in, "rb", 0)
-        self._rest, self._count, self._session = b"", 0, ""
-        self._events: deque[dict[str, Any]] = deque()
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        for domain in ("Page", "Runtime", "Log"):
-            self.call(f"{domain}.enable")
-
-    def call(self, method: str, **parameters: object) -> dict[str, Any]:
-        """What the browser answers to a command."""
-        self._count += 1
-        command: dict[str, object] = {"id": self._count, "method": method, "params": parameters}
-        if self._session:
-            command["sessionId"] = self._session
-        self._out.write(json.dumps(command).encode() + b"\0")
-        while (message := self._next()).get("id") != self._count:
-            self._events.append(message)
-        assert "error" not in message, message
-        found: dict[str, Any] = message["result"]
-        return found
-
-    def open(self, page: Path, width: int, *, dark: bool = False, paper: bool = False) -> tuple[dict[str, Any], str]:
-        """What the probe finds in a page, and what that said on the console."""
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        self.call("Emulation.setEmulatedMedia", media="print" if paper else "", features=scheme)
-        self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 600
-        )
-        self._events.clear()
-        self.call("Page.navigate", url=page.as_uri())
-        while not any(event.get("method") == "Page.loadEventFired" for event in self._events):
-            self._events.append(self._next())
-        found = self.call("Runtime.evaluate", expression=PROBE, returnByValue=True)["result"]["value"]
-        told = ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown")
-        return found, "\n".join(json.dumps(event) for event in self._events if event.get("method") in told)
-
-    def pdf(self) -> bytes:
-        """The page that is open, on paper."""
-        return base64.b64decode(self.call("Page.printToPDF", printBackground=True)["data"])
-
-    def close(self) -> None:
-        self._session = ""
-        self.call("Browser.close")
-        self._process.wait(LIMIT_S)
-        self._out.close()
-        self._in.close()
-
-    def _next(self) -> dict[str, Any]:
-        while b"\0" not in self._rest:
-            some = self._in.read(1 << 20)
-            assert some, "the browser has ended"
-            self._rest += some
-        text, _, self._rest = self._rest.partition(b"\0")
-        message: dict[str, Any] = json.loads(text)
-        return message
-
-
-def browser() -> str:
-    for name in NAMES:
-        found = shutil.which(name)
-        if found:
-            return found
-    pytest.fail(f"no browser: install one of {', '.join(NAMES)}")
+def open_page(
+    window: Browser, page: Path, width: int, *, dark: bool = False, paper: bool = False
+) -> tuple[dict[str, Any], str]:
+    """What the probe finds in a page, and what that said on the console."""
+    console = window.open(page.as_uri(), width, dark=dark, paper=paper)
+    return window.evaluate(PROBE), console
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +115,7 @@ NONE: list[object] = [0, [], [], []]
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_page_is_whole_at_every_width(window: Browser, page: Path, width: int) -> None:
-    found, console = window.open(page, width)
+    found, console = open_page(window, page, width)
     assert console == ""
     assert found["seen"] == width
     assert faults(found) == NONE
@@ -201,7 +126,7 @@ def test_the_page_is_whole_at_every_width(window: Browser, page: Path, width: in
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_comparison_is_whole_at_every_width(window: Browser, comparison: Path, width: int) -> None:
-    found, console = window.open(comparison, width)
+    found, console = open_page(window, comparison, width)
     assert console == ""
     assert faults(found) == NONE
     positions = ["position-north", "position-east", "position-down"]
@@ -212,7 +137,7 @@ def test_a_comparison_is_whole_at_every_width(window: Browser, comparison: Path,
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_page_of_a_fleet_is_whole_at_every_width(window: Browser, fleet: Path, width: int) -> None:
-    found, console = window.open(fleet, width)
+    found, console = open_page(window, fleet, width)
     assert console == ""
     assert faults(found) == NONE
     assert found["hidden"] == []
@@ -221,15 +146,15 @@ def test_the_page_of_a_fleet_is_whole_at_every_width(window: Browser, fleet: Pat
 
 
 def test_dark_pages_are_dark(window: Browser, page: Path) -> None:
-    light, _ = window.open(page, 1000)
-    dark, console = window.open(page, 1000, dark=True)
+    light, _ = open_page(window, page, 1000)
+    dark, console = open_page(window, page, 1000, dark=True)
     assert console == ""
     assert (light["background"], dark["background"]) == ("rgb(243, 245, 247)", "rgb(18, 22, 27)")
 
 
 def test_paper_is_white_and_cuts_nothing(window: Browser, page: Path, comparison: Path, fleet: Path) -> None:
     for one in (page, comparison, fleet):
-        found, _ = window.open(one, PAPER, dark=True, paper=True)
+        found, _ = open_page(window, one, PAPER, dark=True, paper=True)
         assert found["background"] == "rgb(255, 255, 255)"
         assert faults(found) == NONE
         assert found["hidden"] == []
@@ -258,8 +183,8 @@ return {
 
 
 def test_the_slider_moves_one_moment_through_all_drawings(window: Browser, page: Path) -> None:
-    window.open(page, 1000)
-    found = window.call("Runtime.evaluate", expression=f"({MOVE})(5)", returnByValue=True)["result"]["value"]
+    open_page(window, page, 1000)
+    found = window.evaluate(f"({MOVE})(5)")
     assert len(found["times"]) > 10 and found["times"] == pytest.approx([5.0] * len(found["times"]), abs=0.01)
     flight = FlightData.from_records(read(page.with_name("flight.mcap")))
     (true,) = [one.position_m for one in flight.truths if abs(one.at_ns - flight.origin_ns - 5_000_000_000) < 1000]
@@ -275,7 +200,7 @@ def mouse(window: Browser, kind: str, x: float, y: float, **more: object) -> Non
 
 
 def told(window: Browser, expression: str) -> Any:
-    return window.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"]["value"]
+    return window.evaluate(expression)
 
 
 def middle(window: Browser, figure: str) -> tuple[float, float]:
@@ -301,7 +226,7 @@ def wheel(window: Browser, x: float, y: float, **more: object) -> None:
 
 
 def test_the_wheel_alone_scrolls_and_zooms_after_a_click(window: Browser, page: Path) -> None:
-    window.open(page, 1400)
+    open_page(window, page, 1400)
     whole = told(window, SPANS)
     x, y = middle(window, "state-0")
     hint = "document.querySelector('#state-0').classList.contains('hint')"
@@ -320,7 +245,7 @@ def test_the_wheel_alone_scrolls_and_zooms_after_a_click(window: Browser, page: 
 
 
 def test_the_wheel_zooms_all_of_time_dragging_pans_and_a_double_click_resets(window: Browser, page: Path) -> None:
-    _, console = window.open(page, 1400)
+    _, console = open_page(window, page, 1400)
     whole = told(window, SPANS)
     x, y = middle(window, "state-0")
     wheel(window, x, y, modifiers=CTRL)
@@ -344,7 +269,7 @@ def test_the_wheel_zooms_all_of_time_dragging_pans_and_a_double_click_resets(win
 
 
 def test_a_path_zooms_within_its_frame(window: Browser, page: Path) -> None:
-    window.open(page, 1400)
+    open_page(window, page, 1400)
     view = "document.querySelector('#path-above svg').getAttribute('viewBox').split(' ').map(Number)"
     whole = told(window, view)
     x, y = middle(window, "path-above")
@@ -357,17 +282,17 @@ def test_a_path_zooms_within_its_frame(window: Browser, page: Path) -> None:
 def test_without_its_script_the_page_lacks_the_slider_only(window: Browser, page: Path) -> None:
     window.call("Emulation.setScriptExecutionDisabled", value=True)
     try:
-        found, console = window.open(page, 1000)
+        found, console = open_page(window, page, 1000)
     finally:
         window.call("Emulation.setScriptExecutionDisabled", value=False)
     assert console == "" and faults(found) == NONE
     assert len(found["figures"]) == 31
     sliders = "document.querySelectorAll('.cursor, .moment').length"
-    assert window.call("Runtime.evaluate", expression=sliders, returnByValue=True)["result"]["value"] == 0
+    assert window.evaluate(sliders) == 0
 
 
 def test_it_prints(window: Browser, page: Path) -> None:
-    window.open(page, 1000)
+    open_page(window, page, 1000)
     printed = window.pdf()
     assert printed.startswith(b"%PDF")
     assert len(printed) > 20_000
