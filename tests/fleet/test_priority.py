@@ -127,9 +127,13 @@ def test_a_room_for_one_place_has_one() -> None:
     assert make_grid(np.full(3, -0.6), np.full(3, 0.6), 1.2).places_m.tolist() == [[0.0, 0.0]]
 
 
-def follow(distances_m: list[float], goal_m: Array, known: tuple[Progress, ...] = (), first: int = 0) -> Progress:
+def follow(
+    distances_m: list[float], goal_m: Array, known: tuple[Progress, ...] = (), first: int = 0, is_movable: bool = True
+) -> Progress:
     for step, distance_m in enumerate(distances_m, first):
-        known = follow_progress(known, goal_m + np.array([distance_m, 0.0]), goal_m, step, DT_S, 0.15)
+        known = follow_progress(
+            known, goal_m + np.array([distance_m, 0.0]), goal_m, np.array([is_movable]), step, DT_S, 0.15
+        )
     return known[0]
 
 
@@ -141,6 +145,7 @@ def test_a_vehicle_that_comes_no_nearer_is_stuck_until_it_arrives() -> None:
     assert follow([1.0], goal_m, (stuck,), steps + 2).is_stuck
     assert not follow([0.1], goal_m, (stuck,), steps + 2).is_stuck
     assert not follow([2.0], goal_m + 1.0, (stuck,), steps + 2).is_stuck  # to another goal
+    assert not follow([2.0] * (steps + 2), goal_m, is_movable=False).is_stuck
     approach = 2.0 - 1.5 * NEARER_M * np.arange(0.0, 10.0)
     slow = [float(d) for d in np.repeat(approach, steps - 1)]
     assert not follow(slow, goal_m).is_stuck

@@ -302,7 +302,7 @@ def lead(
         parameters: Constants of the cells.
     """
     level_m, level_goals_m = positions_m[:, :2], goals_m[:, :2]
-    progress = follow_progress(known, level_m, level_goals_m, step, parameters.dt_s, ARRIVED_M)
+    progress = follow_progress(known, level_m, level_goals_m, is_led, step, parameters.dt_s, ARRIVED_M)
     room = parameters.room_lower_m, parameters.room_upper_m
     guides_m = choose_guides(positions_m, goals_m, Ways(parameters.distance_m, parameters.margin_m, *room))
     if any(one.is_stuck for one in progress):

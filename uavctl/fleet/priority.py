@@ -43,14 +43,30 @@ class Progress:
 
 
 def follow_progress(
-    known: tuple[Progress, ...], positions_m: Array, goals_m: Array, step: int, dt_s: float, arrived_m: float
+    known: tuple[Progress, ...],
+    positions_m: Array,
+    goals_m: Array,
+    is_movable: Flags,
+    step: int,
+    dt_s: float,
+    arrived_m: float,
 ) -> tuple[Progress, ...]:
-    """Follow the progress of each vehicle to its goal, from positions and goals (N, 2); none is known at the start."""
+    """Follow the progress of each vehicle to its goal.
+
+    Args:
+        known: Progress so far; empty at the start.
+        positions_m: North and east (N, 2).
+        goals_m: North and east (N, 2).
+        is_movable: Whether a vehicle flies to its goal (N,): one on the ground is not stuck.
+        step: Step now.
+        dt_s: Δt.
+        arrived_m: Distance from a goal within which a vehicle is there.
+    """
     followed = []
     for i, (position_m, (north_m, east_m)) in enumerate(zip(positions_m, goals_m.tolist(), strict=True)):
         distance_m = float(np.hypot(north_m - position_m[0], east_m - position_m[1]))
         before = known[i] if known and known[i].goal_m == (north_m, east_m) else None
-        if before is None or distance_m < arrived_m:
+        if before is None or distance_m < arrived_m or not is_movable[i]:
             followed.append(Progress((north_m, east_m), distance_m, step))
         elif distance_m < before.nearest_m - NEARER_M:
             followed.append(Progress((north_m, east_m), distance_m, step, before.is_stuck))
