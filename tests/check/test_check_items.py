@@ -227,10 +227,48 @@ def test_a_second_vehicle_on_the_link_fails() -> None:
     assert not hand.is_done()["other vehicles"].ok
 
 
-def test_the_battery_is_judged_only_if_a_limit_is_given() -> None:
-    assert state(run_check(), "battery") is ItemState.UNDETERMINED
+def test_the_battery_is_judged_by_the_configured_voltage() -> None:
     assert state(run_check(wrong=["check.battery_v=14.0"]), "battery") is ItemState.BAD
     assert state(run_check(wrong=["check.battery_v=4.0"]), "battery") is ItemState.GOOD
+
+
+def report_battery(autopilot: int, threshold: float | None, voltage_v: float, percent: int) -> HandMotion:
+    """A vehicle of this kind with its own threshold of a low battery, if it has one, and its battery."""
+    hand = HandMotion()
+    hand.hold(2.0)
+    hand.report(hand.vehicle.heartbeat(autopilot=autopilot, custom_mode=4))
+    if threshold is not None:
+        name = {3: b"BATT_LOW_VOLT", 12: b"BAT_LOW_THR"}[autopilot]
+        hand.report(hand.vehicle.send("param_value", name, threshold, 9, 1, 0))
+    hand.report(hand.vehicle.send("sys_status", 0, 0, 0, 0, round(1000 * voltage_v), 0, percent, 0, 0, 0, 0, 0, 0))
+    return hand
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "threshold", "voltage_v", "percent", "want"),
+    [
+        (12, 0.15, 11.1, 80, ItemState.GOOD),
+        (12, 0.15, 16.8, 15, ItemState.BAD),  # PX4 judges the charge, whatever the voltage
+        (12, 0.15, 11.1, -1, ItemState.UNDETERMINED),  # the charge is not known
+        (12, None, 11.1, 80, ItemState.UNDETERMINED),
+        (3, 10.5, 11.1, 5, ItemState.GOOD),  # ArduPilot's threshold is a voltage
+        (3, 10.5, 10.4, 90, ItemState.BAD),
+        (3, 0.0, 10.4, 90, ItemState.UNDETERMINED),  # its failsafe is off
+        (3, None, 10.4, 90, ItemState.UNDETERMINED),
+        (3, 10.5, 0.0, 0, ItemState.UNDETERMINED),  # it has no battery monitor
+    ],
+)
+def test_without_a_configured_voltage_the_vehicle_s_own_threshold_judges_the_battery(
+    autopilot: int, threshold: float | None, voltage_v: float, percent: int, want: ItemState
+) -> None:
+    assert state(report_battery(autopilot, threshold, voltage_v, percent).is_done(), "battery") is want
+
+
+def test_the_configured_voltage_comes_before_the_vehicle_s_own_threshold() -> None:
+    low = ["sim.plant='quadrotor'", "sim.quadrotor.charge=0.1"]
+    assert state(run_check(low, ["check.battery_v=1.0"]), "battery") is ItemState.GOOD
+    assert state(run_check(low), "battery") is ItemState.BAD
+    assert state(run_check(low[:1]), "battery") is ItemState.GOOD
 
 
 def test_armed_and_in_the_air_are_told() -> None:

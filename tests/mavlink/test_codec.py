@@ -144,11 +144,15 @@ VEHICLE = Peer(1, 1)
         (VEHICLE.send("extended_sys_state", 0, 0), LandedState(system=1, component=1, landed=None)),
         (
             VEHICLE.send("sys_status", 0, 0, 0, 0, 12_600, 0, 0, 0, 0, 0, 0, 0, 0),
-            Battery(system=1, component=1, voltage_v=12.6, has_radio=False),
+            Battery(system=1, component=1, voltage_v=12.6, remaining=0.0, has_radio=False),
         ),
         (
-            VEHICLE.send("sys_status", 0, 1 << 16 | 1 << 20, 1 << 16, 0, 65_535, 0, 0, 0, 0, 0, 0, 0, 0),
+            VEHICLE.send("sys_status", 0, 1 << 16 | 1 << 20, 1 << 16, 0, 65_535, 0, -1, 0, 0, 0, 0, 0, 0),
             Battery(system=1, component=1, voltage_v=None, has_radio=True, is_within_fence=False),
+        ),
+        (
+            VEHICLE.send("sys_status", 0, 0, 0, 0, 8_100, 0, 87, 0, 0, 0, 0, 0, 0),
+            Battery(system=1, component=1, voltage_v=8.1, remaining=0.87, has_radio=False),
         ),
         (
             VEHICLE.send("battery_status", 0, 0, 0, 0, [4_000, 4_100] + [65_535] * 8, 0, 0, 0, 0),

@@ -61,6 +61,7 @@ class CheckData:
     heartbeat_ns: int = 0  # when the last one came
     landed: bool | None = None
     battery_v: float | None = None
+    battery_remaining: float | None = None  # share of the charge
     estimator: int | None = None  # newest flags of the vehicle's estimator
     # whether it has reported, while a check listened, a position and an external source of it: over a lossy link PX4
     # withdraws the latter for a second again and again
@@ -100,8 +101,9 @@ class CheckData:
                 self.angles_rad.append((at_ns, angles))
             case LandedState(landed=landed):
                 self.landed = landed
-            case Battery(voltage_v=float(voltage_v)):
-                self.battery_v = voltage_v
+            case Battery(voltage_v=voltage_v, remaining=remaining):
+                self.battery_v = self.battery_v if voltage_v is None else voltage_v
+                self.battery_remaining = self.battery_remaining if remaining is None else remaining
             case EstimatorFlags(flags=flags):
                 self.estimator = flags
                 self.is_aided = self.is_aided or bool(flags & HORIZONTAL and flags & AIDED)

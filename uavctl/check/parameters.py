@@ -277,7 +277,8 @@ PX4 = (
 )
 RULES = {3: ARDUPILOT, 12: PX4}  # MAV_AUTOPILOT
 _TAKE_OFF = "MIS_TAKEOFF_ALT"
-_OTHER_PARAMETERS = {3: (), 12: ("COM_RC_IN_MODE", _TAKE_OFF)}
+LOW_VOLTAGE, LOW_CHARGE = "BATT_LOW_VOLT", "BAT_LOW_THR"  # of the vehicle's own low battery: ArduPilot [V], PX4 [share]
+_OTHER_PARAMETERS = {3: (LOW_VOLTAGE,), 12: ("COM_RC_IN_MODE", _TAKE_OFF, LOW_CHARGE)}
 
 
 def list_parameters(autopilot: int | None) -> tuple[str, ...]:

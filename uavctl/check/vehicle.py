@@ -9,12 +9,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.check.check_data import CheckData
 from uavctl.check.findings import Item, ItemState, judge_item, make_item
+from uavctl.check.parameters import LOW_CHARGE, LOW_VOLTAGE
 from uavctl.config.types import Config
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.observation import MOTION_NS
 
 _MAX_SILENCE_S = 3.0
-_NAMES = {3: "ArduPilot", 12: "PX4"}
+_ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
+_NAMES = {_ARDUPILOT: "ArduPilot", _PX4: "PX4"}
 
 
 def check_vehicle(data: CheckData, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
@@ -100,14 +102,27 @@ def _check_velocity_rate(data: CheckData) -> Item:
 
 
 def _check_battery(data: CheckData, config: Config) -> Item:
-    min_v = config.check.battery_v
-    want = f"at least {min_v:g} V (check.battery_v)" if min_v else "check.battery_v is not set"
+    """Judge the battery by `check.battery_v`, or else by the vehicle's own threshold of a low battery."""
+    hint = "charge it, or change it"
+    low_charge = data.get_parameter(LOW_CHARGE, px4=True) if data.autopilot == _PX4 else None
+    if not config.check.battery_v and low_charge and data.battery_remaining is not None:
+        return judge_item(
+            "battery",
+            is_good=data.battery_remaining > low_charge,  # as PX4 judges it before arming
+            value=f"{data.battery_remaining:.0%}",
+            want=f"more than {low_charge:.0%} ({LOW_CHARGE}; check.battery_v is not set)",
+            hint=hint,
+        )
+    low_v = data.get_parameter(LOW_VOLTAGE, px4=False) if data.autopilot == _ARDUPILOT else None
+    min_v, source = config.check.battery_v, "check.battery_v"
+    # 0 V is that of an ArduPilot without a battery monitor, and a threshold of 0 V is none
+    if not min_v and data.battery_v and low_v and low_v > 0.0:
+        min_v, source = low_v, f"{LOW_VOLTAGE}; check.battery_v is not set"
+    want = f"at least {min_v:.4g} V ({source})" if min_v else "check.battery_v is not set"
     if data.battery_v is None:
         return make_item("battery", ItemState.UNDETERMINED, "not reported", want, "check the vehicle's battery monitor")
     value = f"{data.battery_v:.2f} V"
     if not min_v:
-        hint = "set check.battery_v to the lowest voltage to start with"
-        return make_item("battery", ItemState.UNDETERMINED, f"{value}, not judged", want, hint)
-    return judge_item(
-        "battery", is_good=data.battery_v >= min_v, value=value, want=want, hint="charge it, or change it"
-    )
+        unset_hint = "set check.battery_v to the lowest voltage to start with"
+        return make_item("battery", ItemState.UNDETERMINED, f"{value}, not judged", want, unset_hint)
+    return judge_item("battery", is_good=data.battery_v >= min_v, value=value, want=want, hint=hint)

@@ -269,7 +269,7 @@ class CheckConfig(Section, frozen=True, kw_only=True):
     ] = 10.0
     margin_m: Annotated[float, declare("distance outside `sets` at which a flight may begin", "m", 0, 1000)] = 0.25
     rehearsals: Annotated[int, declare("rehearsed flights, for the risk to leave the room", "", 0, MAX_REHEARSALS)] = 60
-    battery_v: Annotated[float, declare("least voltage of the battery; 0: not tested", "V", 0, 1000)] = 0.0
+    battery_v: Annotated[float, declare("least voltage of the battery; 0: vehicle's own threshold", "V", 0, 1000)] = 0.0
     accept: Annotated[tuple[str, ...], declare("items that may fail", length=100)] = ()
 
 

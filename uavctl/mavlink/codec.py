@@ -342,6 +342,7 @@ def _parse_sys_status(raw: MessageFields) -> Battery:
         system=raw.src_system,
         component=raw.src_component,
         voltage_v=raw.voltage_battery / 1000 if known else None,
+        remaining=raw.battery_remaining / 100 if raw.battery_remaining >= 0 else None,
         has_radio=bool(healthy & mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER),
         is_within_fence=not unhealthy & mavlink.MAV_SYS_STATUS_GEOFENCE,
     )

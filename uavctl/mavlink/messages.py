@@ -60,6 +60,7 @@ class Battery(Message, frozen=True, kw_only=True):
     """SYS_STATUS or BATTERY_STATUS."""
 
     voltage_v: float | None  # None if it is not measured
+    remaining: float | None = None  # share of the charge, 0 to 1; None if it is not known
     has_radio: bool | None = None  # a remote control is received; None if unknown
     is_within_fence: bool = True  # it is not beyond a fence of its own
 
