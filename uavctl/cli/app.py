@@ -60,7 +60,7 @@ _COMMANDS = {
     "solve": ("design:solve", "Solve one decision problem, towards the configured target."),
     "identify": ("identify:identify_command", "Identify plant, lag, disturbance and link from a recording."),
     "tune": ("tune:tune", "Excite inside a box, identify, write a tuned configuration, fly again, compare."),
-    "bench": ("bench:bench", "Measure the speed of a decision, beside the problem as printed."),
+    "bench": ("bench:bench", "Measure the speed of a decision, or the link to another computer."),
     "paper": ("paper:paper", "Reproduce Section 5 of the paper, every claim beside its measured figure."),
     "campaign": ("campaign:campaign", "Fly many runs of many controllers on the same noise and the same losses."),
     "ctl": ("ctl:ctl_app", "Send an order to a running flight: goto, hold, resume, land, engage; or show its status."),

@@ -1,4 +1,4 @@
-"""Command `uavctl bench`: how long one decision and one tick take on this machine."""
+"""Command `uavctl bench`: how long one decision and one tick take on this machine, or how a link behaves."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from cyclopts import Parameter
+from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
 
+from uavctl.cli.bench_link import bench_link
 from uavctl.cli.common import DEFAULTS, SPAN_S, Common, locate_design_errors, make_progress
 from uavctl.cli.output import make_table
 from uavctl.errors import UavctlError
 from uavctl.lab.bench.decision import DecisionBench, time_decision
 from uavctl.lab.bench.tick import TickBench, time_tick
+
+_RATE_HZ = validators.Number(gte=1, lte=1000)
 
 
 class Bench(msgspec.Struct, frozen=True, kw_only=True):
@@ -27,13 +30,26 @@ class Bench(msgspec.Struct, frozen=True, kw_only=True):
 
 def bench(
     *,
-    seconds: Annotated[float, Parameter(help="length of the flight that times ticks [s]", validator=SPAN_S)] = 20.0,
+    seconds: Annotated[
+        float, Parameter(help="length of the flight that times ticks, or of --link [s]", validator=SPAN_S)
+    ] = 20.0,
+    link: Annotated[
+        str | None,
+        Parameter(help="measure the link to udpout://HOST:PORT, where udpin://0.0.0.0:PORT answers, in place of speed"),
+    ] = None,
+    rate: Annotated[float, Parameter(help="with --link: packets a second", validator=_RATE_HZ)] = 100.0,
+    out: Annotated[Path, Parameter(help="with --link: folder of configurations and traces")] = Path("link"),
     last: Annotated[
         Path | None, Parameter(help="compare with an earlier run: a file that `uavctl bench --json` wrote")
     ] = None,
     common: Common = DEFAULTS,
 ) -> int:
-    """Measure how long one decision and one tick take on this machine, beside the printed problem and the last run."""
+    """Measure how long one decision and one tick take on this machine, beside the printed problem and the last run.
+
+    With --link it measures losses and delays between two computers instead, and writes them as configurations.
+    """
+    if link is not None:
+        return bench_link(link, seconds, rate, out, common)
     loaded = common.load()
     before = None if last is None else read_bench(last, loaded.config.name)
     options = ["--config", common.config]

@@ -5,6 +5,7 @@ import struct
 from contextlib import nullcontext
 from inspect import signature
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.data_stream import RecordBuilder
@@ -34,7 +35,8 @@ def test_the_format_s_own_readers_take_it(tmp_path: Path) -> None:
         summary = seeking.get_summary()
         by_time = [(channel.topic, message.log_time, message.data) for _, channel, message in seeking.iter_messages()]
         begin = "starting_at" if "starting_at" in signature(seeking.iter_messages).parameters else "start_time"  # < 1.6
-        some = list(seeking.iter_messages(topics=["/uavctl/setpoint"], **{begin: 1_500_000_000}))
+        since: dict[str, Any] = {begin: 1_500_000_000}
+        some = list(seeking.iter_messages(topics=["/uavctl/setpoint"], **since))
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == len(by_time) == count + 2  # and two notes

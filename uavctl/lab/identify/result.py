@@ -276,7 +276,7 @@ def identify(
         residual_std=tuple(response.residual_std_m for response in responses),
         r2=tuple(response.r2 for response in responses),
         spreads=spreads,
-        link=_make_link_section(link),
+        link=make_link_section(link),
         warnings=(
             *_describe_uncertain_axes(responses),
             *_describe_better_plants(chosen, candidates[1:]),
@@ -473,7 +473,7 @@ def _make_config(
         plant=plant,
         estimator=estimator,
         source=source,
-        link=msgspec.structs.replace(config.link, **_make_link_section(link)),
+        link=msgspec.structs.replace(config.link, **make_link_section(link)),
     )
 
 
@@ -522,7 +522,7 @@ def _make_plant_section(config: Config) -> dict[str, object]:
     return {key: value for key in keys if (value := getattr(config.plant, key)) != ()}
 
 
-def _make_link_section(link: LinkFit) -> dict[str, object]:
+def make_link_section(link: LinkFit) -> dict[str, object]:
     """Return the keys of `[link]`: independent losses if the data allow that, else runs as measured."""
     times: dict[str, object] = {"delay_s": link.delay_s, "jitter_s": link.jitter_s}
     if not link.bursts:

@@ -1,0 +1,1 @@
+"""Measurement of a real link between two computers."""
