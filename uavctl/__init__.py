@@ -20,7 +20,7 @@ _MODULES = {
     "link": "uavctl.api.control",
     "load": "uavctl.api.control",
     "plant": "uavctl.api.control",
-    "plot": "uavctl.api.flights",
+    "plot": "uavctl.api.figures",
     "presets": "uavctl.config",
     "read": "uavctl.api.flights",
     "simulate": "uavctl.api.control",

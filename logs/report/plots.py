@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from logs.recording.design_view import AXIS_NUMBER, DesignView
 from logs.recording.flight import FlightData
@@ -195,6 +196,19 @@ def _list_targets(flight: FlightData) -> Array:
     _, states = flight.targets
     changes = np.flatnonzero(np.any(states[1:] != states[:-1], axis=1)) + 1
     return np.asarray(states[[0, *changes]])
+
+
+def make_path_legend(flight: FlightData) -> list[Line2D]:
+    """Make the entries of a legend of `draw_path`."""
+    lines: list[tuple[str, dict[str, Any]]] = [("estimate", {"color": colour("estimate"), "lw": 2.8, "alpha": 0.5})]
+    if flight.truths:
+        lines.append(("truth", {"color": colour("truth"), "lw": 1.0}))
+    if flight.samples:
+        lines.append(("positions", {"color": colour("sample"), "ls": "", "marker": "o", "ms": 2.4}))
+    target = {"ls": DOTTED, "lw": 1.1} if flight.moving_target else {"ls": "", "marker": "*", "ms": 8}
+    lines.append(("target", {"color": colour("target"), **target}))
+    lines.append(("limits", {"color": colour("limit"), "lw": 1.2, "ls": DASHED}))
+    return [Line2D([], [], label=label, **style) for label, style in lines]
 
 
 def _draw_room(ax: Axes, design: DesignView, axes_shown: tuple[str, str]) -> None:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import ast
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.text import Text
 from mcap.reader import make_reader
 from places import ROOT
 
@@ -292,6 +296,40 @@ def test_a_figure_of_runs_shows_paths_target_and_limits() -> None:
             assert any(level == pytest.approx(drawn_level) for drawn_level in levels)
 
 
+@pytest.mark.parametrize(("width", "width_in"), [("column", 3.5), ("page", 7.16)])
+def test_a_figure_for_a_paper_has_its_width_its_fonts_and_no_legend_on_a_line(
+    tmp_path: Path, width: Literal["column", "page"], width_in: float
+) -> None:
+    runs = [uavctl.simulate(uavctl.load("room"), kind, runs=3, steps=5, seed=1) for kind in ("lqg", "pid")]
+    path = tmp_path / "runs.pdf"
+    figure = uavctl.plot(runs, width=width, path=path)
+    assert figure.get_figwidth() == pytest.approx(width_in)
+    texts = [text for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()]
+    assert min(float(text.get_fontsize()) for text in texts) >= 7.0
+    data = path.read_bytes()
+    assert b"/CIDFontType2" in data and b"/FontFile2" in data and b"/Type3" not in data
+    (box,) = re.findall(rb"/MediaBox \[ 0 0 ([0-9.]+) [0-9.]+ \]", data)
+    assert float(box) == pytest.approx(72.0 * width_in, abs=0.1)
+    (legend,) = figure.legends
+    assert {"lqg", "pid", "limit", "target"} <= {text.get_text() for text in legend.get_texts()}
+    bounds = legend.get_window_extent()
+    assert not any(bounds.overlaps(ax.get_window_extent()) for ax in figure.axes)
+    for ax in figure.axes:
+        flown = [line for line in ax.lines if line.get_label() in ("lqg", "pid")]
+        # Luminance of sRGB as it is printed in grey: the lines differ, and so do their dashes
+        greys = [np.dot(to_rgb(line.get_color()), [0.299, 0.587, 0.114]) for line in flown]
+        assert abs(greys[0] - greys[1]) > 0.15
+        assert flown[0].get_linestyle() != flown[1].get_linestyle()
+
+
+def test_a_figure_of_several_controllers_has_the_median_of_each() -> None:
+    runs = [uavctl.simulate(uavctl.load("room"), kind, runs=3, steps=5, seed=1) for kind in ("lqg", "pid")]
+    for number, ax in enumerate(uavctl.plot(runs).axes):
+        drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in ax.lines}
+        for one in runs:
+            np.testing.assert_allclose(drawn[one.controller], np.median(one.states[:, :, 3 * number], axis=0))
+
+
 FILE = "nothing-here.toml"
 
 
@@ -332,6 +370,9 @@ FILE = "nothing-here.toml"
         (lambda: uavctl.read(ROOT), RecordingError, "is a folder"),
         (lambda: uavctl.read(ROOT / "README.md"), RecordingError, "README.md"),
         (lambda: uavctl.plot(3), UsageError, "a int has no figure"),  # type: ignore[arg-type]
+        (lambda: uavctl.plot([], path="a.pdf"), UsageError, "a list has no figure"),
+        (lambda: uavctl.plot([], path="a.mcap"), UsageError, "no file of a figure"),
+        (lambda: uavctl.plot([], width="wide"), UsageError, "'wide'"),  # type: ignore[arg-type]
     ],
 )
 def test_an_error_is_reported_plainly(wrong: Callable[[], object], error: type[Exception], message: str) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -18,7 +18,7 @@ from logs.recording.output_files import refuse_recording_path
 from logs.recording.reader import explain_missing_end, read_header, read_kind
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
-from uavctl.api.control import Runs, Signal, SolvedPlan, Source, get_limits, list_signals, load, resolve_config
+from uavctl.api.control import Source, load, resolve_config
 from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
@@ -26,15 +26,12 @@ from uavctl.daemon.flight_orders import FlightOrders, check_places, compute_stop
 from uavctl.errors import RecordingError, UsageError, in_words, need
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
-from uavctl.smpc.plant import AXES
-from uavctl.wiring.controller import build_flight_design, build_problem, prepare
+from uavctl.wiring.controller import build_flight_design, prepare
 
 if TYPE_CHECKING:
     import pandas
     import polars
     import pyarrow
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -220,142 +217,3 @@ def fly(
         position_m=np.array([sample.position_m for sample in truth]).reshape(-1, 3),
         velocity_mps=np.array([sample.velocity_mps for sample in truth]).reshape(-1, 3),
     )
-
-
-_QUANTILES = (0.05, 0.5, 0.95)
-
-
-def plot(what: SolvedPlan | Runs | Flight | Recording) -> Figure:
-    """Draw a plan, runs or a flight, with names, units and limits; the figure is returned, not shown.
-
-    SolvedPlan: predicted states and inputs, and where it ends. Runs: median of each position (of each state, where a
-    plant has no axes), and between which two values nine in ten runs are. Flight: the path from above and from the
-    side.
-
-    Raises:
-        UsageError: It has no figure.
-        RecordingError: Nothing was flown in the recording.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    if isinstance(what, SolvedPlan):
-        _draw_plan(figure, what)
-    elif isinstance(what, Runs):
-        _draw_runs(figure, what)
-    elif isinstance(what, Flight):
-        _draw_path(figure, what.recording)
-    elif isinstance(what, Recording):
-        _draw_path(figure, what)
-    else:
-        raise UsageError(f"a {type(what).__name__} has no figure; give a result of solve, simulate, fly or read")
-    return figure
-
-
-_PANELS_PER_ROW = 3
-_MAX_PANELS = 12
-
-
-class _Panel(NamedTuple):
-    """Panel of several signals: title, unit, and (label, values (…, T), limits, target) of each signal."""
-
-    title: str
-    unit: str
-    rows: list[tuple[str, Array, tuple[float, float], float | None]]
-
-
-def _group_panels(
-    signals: Sequence[Signal], values: Array, limits: Sequence[tuple[float, float]], target: Array | None
-) -> list[_Panel]:
-    """Group signals of a kind into one panel; each signal of a plant without axes has its own."""
-    panels: dict[str, _Panel] = {}
-    for i, signal in enumerate(signals):
-        axis, _, kind = signal.name.partition(" ")
-        key = kind if axis in AXES else signal.name
-        panel = panels.setdefault(key, _Panel(key, signal.unit, []))
-        label = axis if axis in AXES else signal.name
-        panel.rows.append((label, values[..., i], limits[i], None if target is None else float(target[i])))
-    return list(panels.values())
-
-
-def _draw_plan(figure: Figure, plan: SolvedPlan) -> None:
-    if not plan.inputs.size:
-        raise UsageError(f"there is no plan to draw: {plan!r}")
-    (states, inputs), (state_limits, input_limits) = list_signals(plan.config), get_limits(plan.config)
-    panels = [
-        *_group_panels(states, plan.states, state_limits, plan.reference),
-        *_group_panels(inputs, plan.inputs, input_limits, None),
-    ]
-    for ax, panel in _make_grid(figure, panels, "time ahead [s]"):
-        for number, (label, values, limits, target) in enumerate(panel.rows):
-            time_s = plan.config.plant.dt_s * np.arange(len(values))
-            drawstyle = "steps-post" if len(values) < len(plan.states) else "default"
-            ax.plot(time_s, values, color=f"C{number}", label=label, drawstyle=drawstyle)
-            _draw_limits(ax, limits, target, f"C{number}")
-        _add_legend(ax, panel)
-
-
-def _draw_runs(figure: Figure, runs: Runs) -> None:
-    if runs.failed.all():
-        raise UsageError(f"there is no run to draw: {runs!r}")
-    problem, (states, _), (limits, _) = build_problem(runs.config), list_signals(runs.config), get_limits(runs.config)
-    state_indices = list(problem.plant.position_index) or list(range(problem.plant.n_x))
-    panels = [
-        _Panel(states[i].name, states[i].unit, [("median", runs.states[:, :, i], limits[i], float(problem.target[i]))])
-        for i in state_indices
-    ]
-    for ax, panel in _make_grid(figure, panels, "time [s]"):
-        ((label, values, limits_of_state, target),) = panel.rows
-        low, middle, high = np.quantile(values[~runs.failed], _QUANTILES, axis=0)
-        ax.fill_between(runs.time_s, low, high, alpha=0.25, lw=0, label="nine in ten runs")
-        ax.plot(runs.time_s, middle, label=label)
-        _draw_limits(ax, limits_of_state, target, "C3")
-        _add_legend(ax, panel)
-
-
-def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, colour: str) -> None:
-    for limit in limits:
-        if np.isfinite(limit):
-            ax.axhline(limit, ls="--", lw=1.0, color=colour, alpha=0.7)
-    if target is not None:
-        ax.axhline(target, ls=":", lw=1.0, color=colour)
-
-
-def _add_legend(ax: Axes, panel: _Panel) -> None:
-    ax.plot([], [], ls="--", lw=1.0, color="0.4", label="limit")
-    if any(target is not None for *_, target in panel.rows):
-        ax.plot([], [], ls=":", lw=1.0, color="0.4", label="target")
-    ax.legend(fontsize="x-small")
-
-
-def _make_grid(figure: Figure, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
-    """Yield axes for the first panels, a few in a row, with title, unit and time."""
-    shown = panels[:_MAX_PANELS]
-    columns = min(_PANELS_PER_ROW, len(shown))
-    rows = -(-len(shown) // columns)
-    figure.set_size_inches(3.4 * columns + 0.6, 2.9 * rows)
-    for position, panel in enumerate(shown, 1):
-        ax = figure.add_subplot(rows, columns, position)
-        unit = f" [{panel.unit}]" if panel.unit else ""
-        ax.set(title=panel.title.capitalize(), xlabel=x_label, ylabel=f"{panel.title}{unit}")
-        ax.grid(visible=True, alpha=0.3)
-        yield ax, panel
-
-
-def _draw_path(figure: Figure, recording: Recording) -> None:
-    from logs.report.plots import draw_path
-
-    views = [("From above", ("east", "north"))]
-    if "down" in recording.data.design.axes:
-        views.append(("From the south", ("east", "down")))
-    for position, (title, view_axes) in enumerate(views, 1):
-        names = ["height" if axis == "down" else axis for axis in view_axes]
-        ax = _add_axes(figure, len(views), position, title, f"{names[0]} [m]", f"{names[1]} [m]")
-        draw_path(ax, recording.data, view_axes)
-
-
-def _add_axes(figure: Figure, count: int, position: int, title: str, x_label: str, y_label: str) -> Axes:
-    ax = figure.add_subplot(1, count, position)
-    ax.set(title=title, xlabel=x_label, ylabel=y_label)
-    ax.grid(visible=True, alpha=0.3)
-    return ax

@@ -1,0 +1,263 @@
+"""Figures of plans, runs and flights: for a notebook, or for a paper at the width of its columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from logs.recording.output_files import refuse_recording_path
+from uavctl.api.control import Runs, Signal, SolvedPlan, get_limits, list_signals
+from uavctl.api.flights import Flight, Recording
+from uavctl.arrays import Array
+from uavctl.errors import UsageError
+from uavctl.smpc.plant import AXES
+from uavctl.wiring.controller import build_problem
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Width = Literal["column", "page"]
+WIDTHS_IN = {"column": 3.5, "page": 7.16}  # of a column, and of both with the gap between: IEEE's two-column papers
+# Type 42 embeds whole fonts, as publishers ask; matplotlib's default, type 3, is refused. An SVG has outlines.
+_EMBEDDED: dict[str, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path"}
+_PAPER: dict[str, Any] = {
+    **_EMBEDDED,
+    "font.size": 8.0,
+    "axes.titlesize": 8.0,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "legend.fontsize": 7.0,
+    "axes.linewidth": 0.6,
+    "lines.linewidth": 1.2,
+}
+_SUFFIXES = (".pdf", ".svg", ".eps", ".png")
+_DOTS_PER_INCH = 300  # of a PNG
+_NOTEBOOK_COLOURS = ("C0", "C1", "C2")
+# Tol's high-contrast set: as grey, 25, 46 and 70 % light (https://sronpersonalpages.nl/~pault/, 2021).
+_PAPER_COLOURS = ("#004488", "#bb5566", "#ddaa33")
+_LINES = ("-", "-.", (0, (4, 1, 1, 1, 1, 1)))  # of several controllers
+_QUANTILES = (0.05, 0.5, 0.95)
+_PANELS_PER_ROW = 3
+_MAX_PANELS = 12
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """A figure being drawn."""
+
+    figure: Figure
+    width: Width | None
+    entries: dict[str, Artist] = field(default_factory=dict)  # of the legend of all panels, in a paper
+
+    def add_legend(self, ax: Axes) -> None:
+        """Add the legend of a panel; in a paper one below all panels, where it covers no line."""
+        if self.width is None:
+            ax.legend(fontsize=7.0)
+            return
+        handles, labels = ax.get_legend_handles_labels()
+        self.entries.update({label: self.entries.get(label, one) for label, one in zip(labels, handles, strict=True)})
+
+    def draw_legend(self) -> None:
+        """Draw the legend of all panels."""
+        if self.entries:
+            columns = 3 if self.width == "column" else len(self.entries)
+            self.figure.legend(
+                self.entries.values(), self.entries.keys(), loc="outside lower center", ncols=columns, frameon=False
+            )
+
+    def get_colour(self, number: int) -> str:
+        """Return the colour of a signal or controller."""
+        colours = _NOTEBOOK_COLOURS if self.width is None else _PAPER_COLOURS
+        return colours[number % len(colours)]
+
+    def make_axes(self, count: int) -> Iterator[Axes]:
+        """Make as many axes, a few in a row; in a column one below the other."""
+        columns = 1 if self.width == "column" else min(_PANELS_PER_ROW, count)
+        rows = -(-count // columns)
+        size_in = (3.4 * columns + 0.6, 2.9 * rows)
+        if self.width is not None:
+            size_in = (WIDTHS_IN[self.width], (1.7 if self.width == "column" else 2.1) * rows)
+        self.figure.set_size_inches(*size_in)
+        for position in range(count):
+            ax = self.figure.add_subplot(rows, columns, position + 1)
+            ax.grid(visible=True, alpha=0.3)
+            yield ax
+
+
+def plot(
+    what: SolvedPlan | Runs | Sequence[Runs] | Flight | Recording,
+    *,
+    width: Width | None = None,
+    path: Path | str | None = None,
+) -> Figure:
+    """Draw a plan, runs or a flight, with names, units and limits; the figure is returned, not shown.
+
+    SolvedPlan: predicted states and inputs, and where it ends. Runs, of one or several controllers: median of each
+    position (of each state, where a plant has no axes), and between which two values nine in ten runs are. Flight: the
+    path from above and from the side.
+
+    Args:
+        what: A result of `solve`, `simulate`, `fly` or `read`.
+        width: "column" (3.5 in) or "page" (7.16 in): sizes, fonts and colours of a paper, also printed in grey.
+        path: File to write: PDF, SVG, EPS or PNG, with embedded fonts.
+
+    Raises:
+        UsageError: It has no figure, or the file has another ending.
+        RecordingError: Nothing was flown in the recording.
+    """
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
+    if width is not None and width not in WIDTHS_IN:
+        raise UsageError(f"width {width!r}: give {' or '.join(WIDTHS_IN)}")
+    if path is not None and Path(path).suffix.lower() not in _SUFFIXES:
+        raise UsageError(f"{path}: is no file of a figure; end its name with {', '.join(_SUFFIXES)}")
+    with style.context(_EMBEDDED if width is None else _PAPER):
+        figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+        sheet = _Sheet(figure, width)
+        _draw(sheet, what)
+        sheet.draw_legend()
+        if path is not None:
+            refuse_recording_path(Path(path))
+            figure.savefig(path, dpi=_DOTS_PER_INCH)
+    return figure
+
+
+def _draw(sheet: _Sheet, what: object) -> None:
+    if isinstance(what, SolvedPlan):
+        _draw_plan(sheet, what)
+    elif isinstance(what, Runs):
+        _draw_runs(sheet, [what])
+    elif isinstance(what, list | tuple) and what and all(isinstance(one, Runs) for one in what):
+        _draw_runs(sheet, what)
+    elif isinstance(what, Flight):
+        _draw_path(sheet, what.recording)
+    elif isinstance(what, Recording):
+        _draw_path(sheet, what)
+    else:
+        raise UsageError(f"a {type(what).__name__} has no figure; give a result of solve, simulate, fly or read")
+
+
+class _Panel(NamedTuple):
+    """Panel of several signals: title, unit, and (label, values (…, T), limits, target) of each signal."""
+
+    title: str
+    unit: str
+    rows: list[tuple[str, Array, tuple[float, float], float | None]]
+
+
+def _group_panels(
+    signals: Sequence[Signal], values: Array, limits: Sequence[tuple[float, float]], target: Array | None
+) -> list[_Panel]:
+    """Group signals of a kind into one panel; each signal of a plant without axes has its own."""
+    panels: dict[str, _Panel] = {}
+    for i, signal in enumerate(signals):
+        axis, _, kind = signal.name.partition(" ")
+        key = kind if axis in AXES else signal.name
+        panel = panels.setdefault(key, _Panel(key, signal.unit, []))
+        label = axis if axis in AXES else signal.name
+        panel.rows.append((label, values[..., i], limits[i], None if target is None else float(target[i])))
+    return list(panels.values())
+
+
+def _draw_plan(sheet: _Sheet, plan: SolvedPlan) -> None:
+    if not plan.inputs.size:
+        raise UsageError(f"there is no plan to draw: {plan!r}")
+    (states, inputs), (state_limits, input_limits) = list_signals(plan.config), get_limits(plan.config)
+    panels = [
+        *_group_panels(states, plan.states, state_limits, plan.reference),
+        *_group_panels(inputs, plan.inputs, input_limits, None),
+    ]
+    for ax, panel in _make_grid(sheet, panels, "time ahead [s]"):
+        for number, (label, values, limits, target) in enumerate(panel.rows):
+            time_s = plan.config.plant.dt_s * np.arange(len(values))
+            drawstyle = "steps-post" if len(values) < len(plan.states) else "default"
+            ax.plot(time_s, values, color=sheet.get_colour(number), label=label, drawstyle=drawstyle)
+            _draw_limits(ax, limits, target, sheet.get_colour(number))
+        _add_legend(sheet, ax, panel)
+
+
+def _draw_runs(sheet: _Sheet, compared: Sequence[Runs]) -> None:
+    config = compared[0].config
+    for runs in compared:
+        if runs.failed.all():
+            raise UsageError(f"there is no run to draw: {runs!r}")
+    if any(list_signals(runs.config) != list_signals(config) for runs in compared):
+        raise UsageError("runs of different plants have no common figure; draw each alone")
+    problem, (states, _), (limits, _) = build_problem(config), list_signals(config), get_limits(config)
+    state_indices = list(problem.plant.position_index) or list(range(problem.plant.n_x))
+    panels = [
+        _Panel(
+            states[i].name,
+            states[i].unit,
+            [
+                (
+                    "median" if len(compared) == 1 else runs.controller,
+                    runs.states[:, :, i],
+                    limits[i],
+                    float(problem.target[i]),
+                )
+                for runs in compared
+            ],
+        )
+        for i in state_indices
+    ]
+    for ax, panel in _make_grid(sheet, panels, "time [s]"):
+        for number, (runs, (label, values, _, _)) in enumerate(zip(compared, panel.rows, strict=True)):
+            low, middle, high = np.quantile(values[~runs.failed], _QUANTILES, axis=0)
+            paint, band = sheet.get_colour(number), "nine in ten runs" if number == 0 else None
+            ax.fill_between(runs.time_s, low, high, color=paint, alpha=0.2, lw=0, label=band)
+            ax.plot(runs.time_s, middle, color=paint, ls=_LINES[number % len(_LINES)], label=label)
+        *_, limits_of_state, wanted = panel.rows[0]
+        _draw_limits(ax, limits_of_state, wanted, "0.4" if len(compared) > 1 or sheet.width else "C3")
+        _add_legend(sheet, ax, panel)
+
+
+def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, colour: str) -> None:
+    for limit in limits:
+        if np.isfinite(limit):
+            ax.axhline(limit, ls="--", lw=1.0, color=colour, alpha=0.7)
+    if target is not None:
+        ax.axhline(target, ls=":", lw=1.0, color=colour)
+
+
+def _add_legend(sheet: _Sheet, ax: Axes, panel: _Panel) -> None:
+    ax.plot([], [], ls="--", lw=1.0, color="0.4", label="limit")
+    if any(target is not None for *_, target in panel.rows):
+        ax.plot([], [], ls=":", lw=1.0, color="0.4", label="target")
+    sheet.add_legend(ax)
+
+
+def _make_grid(sheet: _Sheet, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
+    """Yield axes for the first panels, with unit and time, and with a title outside of papers."""
+    shown = panels[:_MAX_PANELS]
+    for ax, panel in zip(sheet.make_axes(len(shown)), shown, strict=True):
+        unit = f" [{panel.unit}]" if panel.unit else ""
+        ax.set(xlabel=x_label, ylabel=f"{panel.title}{unit}")
+        if sheet.width is None:
+            ax.set_title(panel.title.capitalize())
+        yield ax, panel
+
+
+def _draw_path(sheet: _Sheet, recording: Recording) -> None:
+    from logs.report.plots import draw_path, make_path_legend
+
+    data = recording.data
+    views = [("From above", ("east", "north"))]
+    if "down" in data.design.axes:
+        views.append(("From the south", ("east", "down")))
+    for ax, (title, view_axes) in zip(sheet.make_axes(len(views)), views, strict=True):
+        names = ["height" if axis == "down" else axis for axis in view_axes]
+        ax.set(title=title, xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")
+        draw_path(ax, data, view_axes)
+    if sheet.width is not None:
+        size_in = sheet.figure.get_size_inches()
+        sheet.figure.set_size_inches(size_in[0], size_in[1] * (1.6 if sheet.width == "column" else 1.4))
+    sheet.entries.update({str(line.get_label()): line for line in make_path_legend(data)})
