@@ -27,6 +27,8 @@ from patience import wait_until
 from places import ROOT, without_pages
 
 from logs.live.client import SceneReader
+from logs.recording.fleet_replay import replay_coordinator
+from logs.recording.topics import CYCLE
 from logs.report.fleet import read_fleet as read_flown_fleet
 from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
@@ -512,8 +514,11 @@ def test_two_vehicles_in_cells_exchange_their_places_and_then_land() -> None:
         for name, track in truths.items():
             wait_until(lambda track=track: any(truth.mode == "AUTO.LAND" for truth in track), f"{name} lands")  # type: ignore[misc]
         wait_until(lambda: fleet.poll() is not None, "the end")
-        with (path.parent / "out" / "coordinator.mcap").open("rb") as file:
-            cycles = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages()]
+        recording = path.parent / "out" / "coordinator.mcap"
+        with recording.open("rb") as file:
+            cycles = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics=[CYCLE])]
+        replayed = replay_coordinator(recording)
+        assert replayed.identical and replayed.decisions == len(cycles) and not replayed.lacks_end
     east = {truth.at_ns: truth.position_m for truth in truths["east"]}
     pairs = [(truth.position_m, east[truth.at_ns]) for truth in truths["west"] if truth.at_ns in east]
     # The radii of the simulated vehicles are 0.07 m
