@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from logs.recording.coordinator import CoordinatorRecording
+from logs.recording.fleet_replay import replay_coordinator
 from logs.recording.reader import read_kind
 from uavctl.arrays import Array
+from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config import load_config
 from uavctl.daemon.cell_exchange import CellExchange, ExchangedVehicle
 from uavctl.daemon.control_socket import ControlServer, open_listener
@@ -80,7 +83,8 @@ def fly(folder: Path, stands_still_s: tuple[float, float]) -> tuple[Array, Array
         [folder / f"v{number}.mcap" for number in range(2)],
         folder / "world.mcap",
     )
-    coordinator = Coordinator(build_cell_parameters(configs, DISTANCE_M), 2)
+    parameters, path = build_cell_parameters(configs, DISTANCE_M), folder / "coordinator.mcap"
+    coordinator = Coordinator(parameters, 2)
     boxes: list[Array] = []
     with ExitStack() as stack:
         daemons = []
@@ -92,7 +96,10 @@ def fly(folder: Path, stands_still_s: tuple[float, float]) -> tuple[Array, Array
             stack.callback(server.close)
             daemons.append(Daemon(orders, server))
         vehicles = [ExchangedVehicle(f"v{number}", folder / f"v{number}.sock") for number in range(2)]
-        exchange = CellExchange(coordinator, vehicles, lambda _: None, pytest.fail)
+        recording = stack.enter_context(
+            CoordinatorRecording(path, ("v0", "v1"), parameters, start_ns=0, zero_utc_ns=VIRTUAL_ZERO_UTC_NS)
+        )
+        exchange = CellExchange(coordinator, vehicles, lambda at_ns: recording.add(at_ns, coordinator), pytest.fail)
         stack.callback(exchange.close)
 
         def wake(flown_s: float) -> bool:
@@ -116,6 +123,10 @@ def fly(folder: Path, stands_still_s: tuple[float, float]) -> tuple[Array, Array
         finally:
             fleet.close()
     assert not fleet.collisions
+    replayed = replay_coordinator(path)
+    assert replayed.identical and not replayed.lacks_end
+    # Ten cycles a second; from 6 s on, until the crossing at least, each vehicle gets nearly as many cells
+    assert replayed.decisions > 10.0 * CROSSING_S - 10.0 and replayed.compared - replayed.decisions > 20
     truths = list(read_kind(folder / "world.mcap", FleetTruth))
     places_m = np.array([[vehicle.position_m for vehicle in truth.vehicles] for truth in truths])
     return np.array([truth.at_ns * 1e-9 for truth in truths]), places_m, np.array(boxes)
