@@ -13,6 +13,7 @@ import pytest
 from places import without_pages
 
 from uavctl.arithmetic import CHOICE, OWN, PORTABLE, choose_arithmetic, without_choice
+from uavctl.arrays import add
 
 HASWELL = {"abm", "avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe", "sse4_2"}
 WIDE = {*HASWELL, "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
@@ -117,3 +118,9 @@ def test_a_flight_is_replayed_with_the_arithmetic_that_it_was_made_with_or_to_a_
         assert found["identical"] and b"arithmetic" not in messages  # as is told of what is here another than there
     assert b"arithmetic" not in told(portable, "log", "whatif", "own/flight.mcap")[1]
     assert told(own, "log", "replay", "portable/flight.mcap", "--tolerance", "1e-6")[0]["identical"]
+
+
+def test_a_sum_rounds_after_each_term_in_every_version_of_python() -> None:
+    # Since Python 3.12 the sum of the first list is 1.0, that of the second one 1.0.
+    assert add([1e16, 1.0, -1e16]) == 0.0
+    assert add([0.1] * 10) == 0.9999999999999999
