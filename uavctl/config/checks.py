@@ -135,6 +135,23 @@ def _check_trajectory(plant: PlantConfig, sets: SetsConfig, trajectory: Trajecto
         )
     for i, position_m in enumerate(trajectory.positions_m):
         yield from find_outside(plant, sets, position_m, f"{key}.positions_m[{i}]", "trajectory")
+    for i, velocity_mps in enumerate(trajectory.velocities_mps):
+        yield from _find_too_fast(plant, sets, velocity_mps, f"{key}.velocities_mps[{i}]")
+
+
+def _find_too_fast(plant: PlantConfig, sets: SetsConfig, velocity_mps: Position, key: str) -> Iterator[ConfigProblem]:
+    """Components of a velocity that are outside the limits of the velocity."""
+    indices = tuple(i + 1 for i in get_position_index(plant)) if plant.states_per_axis else plant.velocity_index
+    for axis, i in zip(plant.axes, indices, strict=False):
+        if not 0 <= i < min(len(sets.state_lower), len(sets.state_upper)):
+            continue  # reported separately
+        low, high, number = sets.state_lower[i], sets.state_upper[i], _AXES.index(axis)
+        if not low <= velocity_mps[number] <= high:
+            yield ConfigProblem(
+                f"{key}[{number}]",
+                f"{axis} {velocity_mps[number]:g} m/s is outside the limits [{low:g}, {high:g}]",
+                "fly the trajectory slower, or widen the limits of this velocity",
+            )
 
 
 def check_fences(plant: PlantConfig, sets: SetsConfig, fences: Sequence[FenceConfig]) -> Iterator[ConfigProblem]:

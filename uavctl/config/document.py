@@ -7,6 +7,7 @@ its line before further processing.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import stat
@@ -210,6 +211,15 @@ def read_row_lines(path: Path) -> list[str]:
         ],
     )
     return lines
+
+
+def parse_number(cell: str) -> float | None:
+    """Return the number in a cell; None if it is none, or is not finite."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
 
 
 def refuse_file(path: Path, reasons: Sequence[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,9 +22,11 @@ from uavctl.config.document import (
     Position,
     Section,
     declare,
+    parse_number,
     read_row_lines,
     refuse_file,
 )
+from uavctl.config.polynomials import has_polynomials, sample_polynomials
 
 
 class TrajectoryConfig(Section, frozen=True, kw_only=True):
@@ -47,7 +48,8 @@ class TrajectoryConfig(Section, frozen=True, kw_only=True):
         str,
         declare(
             "CSV file with the samples, beside this one: t, x, y, z and perhaps vx, vy, vz; or with a header, as in "
-            "`time_ms`, `east_m`, `height [cm]`",
+            "`time_ms`, `east_m`, `height [cm]`; or polynomials of uav_trajectories: duration, x^0 … yaw^7 (yaw 0), "
+            "with x east, y north, z up",
             length=MAX_PATH_LENGTH,
         ),
     ] = ""
@@ -204,7 +206,10 @@ def _read_rows(path: Path) -> list[tuple[int, Floats]]:
             lines.append((number, text))
     if len(lines) > MAX_TRAJECTORY_SAMPLES + 1:  # more, also if the first one names the columns
         raise DataFileError((f"{path}: has {len(lines)} rows, more than {MAX_TRAJECTORY_SAMPLES}",))
-    columns, rows = _read_columns(path, [(number, text.split(",")) for number, text in lines])
+    cells = [(number, text.split(",")) for number, text in lines]
+    if cells and has_polynomials(cells[0][1]):
+        return sample_polynomials(path, cells)
+    columns, rows = _read_columns(path, cells)
     if not rows:
         raise DataFileError((f"{path}: has no rows",))
     if len(rows) > MAX_TRAJECTORY_SAMPLES:
@@ -234,7 +239,7 @@ def _read_columns(
     Raises:
         DataFileError: The header has unknown columns, or lacks required ones.
     """
-    if not rows or any(_parse_number(cell) is not None for cell in rows[0][1]):
+    if not rows or any(parse_number(cell) is not None for cell in rows[0][1]):
         return [], rows
     (line, cells), rows = rows[0], rows[1:]
     columns, problems = read_header(cells)
@@ -258,16 +263,8 @@ def _find_row_problems(cells: list[str], width: int) -> Iterator[str]:
     elif len(cells) != width:
         yield f"has {len(cells)} columns, the first row has {width}"
     for cell in cells:
-        value = _parse_number(cell)
+        value = parse_number(cell)
         if value is None:
             yield f'"{cell.strip()[:_MAX_SHOWN]}" is not a finite number'
         elif abs(value) > MAX_NUMBER:
             yield f"{value:g} is beyond {MAX_NUMBER:g}"
-
-
-def _parse_number(cell: str) -> float | None:
-    try:
-        value = float(cell)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
