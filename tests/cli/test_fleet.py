@@ -11,7 +11,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +23,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from msgspec.structs import replace
 from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, end_process, reserve_port
-from patience import wait_until
+from order_rig import FakeDaemon, answer
+from patience import LIMIT_S, wait_until
 from places import ROOT, without_pages
 
 from logs.live.client import SceneReader
@@ -38,7 +39,7 @@ from uavctl.cli.fleet_file import Member, compute_gap_m, read_fleet
 from uavctl.cli.fleet_view import choose_ports
 from uavctl.config import load_config
 from uavctl.daemon.cell_exchange import CellExchange
-from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
+from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest, make_socket_path
 from uavctl.errors import ConfigError, NotReachedError
 from uavctl.records import Truth
 from uavctl.wiring.cells import Coordinator, build_cell_parameters
@@ -199,6 +200,37 @@ def test_without_daemons_status_and_land_fail(fleet_file: Path, capsys: pytest.C
     assert run(["fleet", "land", str(fleet_file)]) == 1
     output = capsys.readouterr().err
     assert "west: land not reached" in output and "east: land not reached" in output
+
+
+@pytest.mark.parametrize(
+    ("head", "asked"), [("spacing_m = 0.5", ["land"]), (f"distance_m = {SPACING_M}", ["hold", "land"])]
+)
+def test_in_cells_all_come_to_rest_before_they_land(
+    head: str, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    boxes = (WEST, EAST) if head.startswith("spacing") else ((-2.5, 2.5), (-2.5, 2.5))
+    path = tmp_path / "fleet.toml"
+    places_m = ("target.position_m=[0,-1,-1.2]", "target.position_m=[0,1,-1.2]")
+    entries = [
+        make_entry(name, box, f"udpin://127.0.0.1:{24541 + i}", "udpin://127.0.0.1:0", places_m[i])
+        for i, (name, box) in enumerate(zip("ab", boxes, strict=True))
+    ]
+    path.write_text(f"{head}\n" + "".join(entries))
+    monkeypatch.setattr("uavctl.cli.fleet.REST_S", 0.0)
+    with tempfile.TemporaryDirectory() as short, ExitStack() as stack:  # sockets want short names
+        monkeypatch.setenv(FOLDER_VARIABLE, short)
+        daemons = []
+        for member in read_fleet(path).members:
+            daemons.append(FakeDaemon(make_socket_path(Path(short), member.daemon), answer(ok=True, text="landing")))
+            stack.callback(daemons[-1].close)
+        daemons[0].may_answer.clear()
+        landing = threading.Thread(target=lambda: run(["fleet", "land", str(path)]))
+        landing.start()
+        wait_until(lambda: all(daemon.requests for daemon in daemons), "one that hangs delays no other")
+        assert [daemon.requests[0].ask for daemon in daemons] == [asked[0]] * 2
+        daemons[0].may_answer.set()
+        landing.join(LIMIT_S)
+        assert [[request.ask for request in daemon.requests] for daemon in daemons] == [asked] * 2
 
 
 RADIO = "[radio]\nbytes_per_s = 5760\nrate_hz = 50\nloss = 0.3\n"

@@ -17,11 +17,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from itertools import combinations, zip_longest
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 from rich.console import Group
@@ -43,7 +44,7 @@ from uavctl.cli.signals import stop_on_signals
 from uavctl.cli.usage import format_example
 from uavctl.clock import monotonic_ns, read_zero_utc_ns
 from uavctl.daemon.cell_exchange import CellExchange, ExchangedVehicle, run_exchange
-from uavctl.daemon.control_socket import ControlRequest, find_control_folder, make_socket_path
+from uavctl.daemon.control_socket import ControlRequest, Reply, find_control_folder, make_socket_path
 from uavctl.daemon.health import Health
 from uavctl.errors import NotReachedError, UavctlError, in_words
 from uavctl.fleet.boxes import DOWNWASH
@@ -180,21 +181,24 @@ def status(
 ) -> int:
     """Show the state of all vehicles of a file in one table. Exit code 1: not all daemons answer."""
     fleet, folder = read_fleet(file), find_control_folder(control)
-    health = {member.name: _read_health(member, folder) for member in fleet.members}
+    health = _read_health(fleet.members, folder)
     Common(json=json).show("fleet/status", {"vehicles": health}, lambda: _make_status_table(health))
     return 0 if all(health.values()) else 1
 
 
 @fleet_app.command(help_epilogue=format_example("fleet land"))
 def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None) -> int:
-    """Land all vehicles of a file. Exit code 1: not all of them take the order."""
+    """Land all vehicles of a file; those in cells first come to rest. Exit code 1: not all of them take the order."""
     fleet, folder, all_accepted = read_fleet(file), find_control_folder(control), True
-    for member in fleet.members:
-        try:
-            reply = send_request(ControlRequest(ask="land"), folder, member.daemon)
+    if fleet.cells is not None:  # who brakes leaves its cell
+        print_message(f"all vehicles come to rest in their cells for {REST_S:g} s", highlight=False)
+        _ask_all(fleet.members, folder, "hold")
+        time.sleep(REST_S)
+    for member, reply in zip(fleet.members, _ask_all(fleet.members, folder, "land"), strict=True):
+        if isinstance(reply, NotReachedError):
+            verdict, text = "not reached", str(reply)
+        else:
             verdict, text = ("accepted" if reply.ok else "refused"), reply.text
-        except NotReachedError as error:
-            verdict, text = "not reached", str(error)
         all_accepted = all_accepted and verdict == "accepted"
         print_message(f"{member.name}: land {verdict}: {text}", highlight=False)
     return 0 if all_accepted else 1
@@ -409,9 +413,12 @@ def run_fleet_daemon(rest_s: float) -> None:
             time.sleep(rest_s)
         signal.raise_signal(signal.SIGINT)
 
-    threading.Thread(target=wait_for_close, name="fleet", daemon=True).start()
-    hide_health_lines()  # the fleet's table has the health of each vehicle
-    main()
+    try:
+        threading.Thread(target=wait_for_close, name="fleet", daemon=True).start()
+        hide_health_lines()  # the fleet's table has the health of each vehicle
+        main()
+    except KeyboardInterrupt:  # before the command line answers signals
+        sys.exit(128 + signal.SIGINT)
 
 
 def _find_failure(flights: Sequence[FleetFlight], health_by_name: HealthByName) -> str:
@@ -436,8 +443,8 @@ def _show_status(flights: Sequence[FleetFlight]) -> Iterator[HealthByName]:
     )
 
     def refresh() -> Table:
-        for flight in flights:
-            health_by_name[flight.member.name] = _read_health(flight.member, folder) if flight.is_running() else None
+        health_by_name.update({flight.member.name: None for flight in flights if not flight.is_running()})
+        health_by_name.update(_read_health([flight.member for flight in flights if flight.is_running()], folder))
         return _make_status_table(health_by_name)
 
     def draw() -> None:
@@ -462,12 +469,28 @@ def _show_status(flights: Sequence[FleetFlight]) -> Iterator[HealthByName]:
         thread.join(TABLE_PERIOD_S)
 
 
-def _read_health(member: Member, folder: Path) -> Health | None:
-    """Return the health of a vehicle; None where its daemon does not answer."""
-    try:
-        return send_request(ControlRequest(ask="status"), folder, member.daemon).status
-    except NotReachedError:
-        return None
+def _ask_all(
+    members: Sequence[Member], folder: Path, ask: Literal["hold", "land", "status"]
+) -> list[Reply | NotReachedError]:
+    """Ask all daemons at once: one that hangs delays no other."""
+
+    def send(member: Member) -> Reply | NotReachedError:
+        try:
+            return send_request(ControlRequest(ask=ask), folder, member.daemon)
+        except NotReachedError as error:
+            return error
+
+    with ThreadPoolExecutor(len(members)) as pool:
+        return list(pool.map(send, members))
+
+
+def _read_health(members: Sequence[Member], folder: Path) -> HealthByName:
+    """Return the health of vehicles; None where a daemon does not answer."""
+    replies = _ask_all(members, folder, "status") if members else []
+    return {
+        member.name: None if isinstance(reply, NotReachedError) else reply.status
+        for member, reply in zip(members, replies, strict=True)
+    }
 
 
 def _make_status_table(health_by_name: HealthByName) -> Table:
