@@ -133,8 +133,10 @@ class Scene:
                 process.send_signal(signal.SIGCONT)
                 process.kill()
                 process.wait()
-        for pid in self.find_daemons():
-            os.kill(pid, signal.SIGKILL)
+        while daemons := self.find_daemons():
+            for pid in daemons:
+                os.kill(pid, signal.SIGKILL)
+            time.sleep(0.1)
         self._is_over.set()
         self._thread.join(10.0)
 

@@ -34,7 +34,7 @@ from logs.report.fleet import read_fleet as read_flown_fleet
 from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
 from uavctl.cli.ctl import send_request
-from uavctl.cli.fleet import Coordination, FleetEnd, FleetFlight
+from uavctl.cli.fleet import ORDERED, RUNS, Coordination, FleetEnd, FleetFlight, wait_for_end
 from uavctl.cli.fleet_file import Member, compute_gap_m, read_fleet
 from uavctl.cli.fleet_view import choose_ports
 from uavctl.config import load_config
@@ -348,6 +348,22 @@ def test_without_a_coordinator_vehicles_have_time_to_rest_before_they_land(
     assert flight.is_requested
 
 
+def test_a_daemon_ends_when_the_fleet_orders_it_is_killed_or_stands_still() -> None:
+    for written, closes, expected in (
+        (RUNS + ORDERED, False, "ordered"),
+        (RUNS, True, "killed"),
+        (RUNS, False, "stands still"),
+    ):
+        reader, writer = os.pipe()
+        os.write(writer, written)
+        if closes:
+            os.close(writer)
+        assert wait_for_end(reader, 0.2) == expected
+        os.close(reader)
+        if not closes:
+            os.close(writer)
+
+
 class TimedFlight:
     """A daemon that runs until its end is requested."""
 
@@ -360,6 +376,8 @@ class TimedFlight:
     def start(self) -> None: ...
 
     def join_output(self) -> None: ...
+
+    def tell_running(self) -> None: ...
 
     def is_running(self) -> bool:
         return not self.is_requested and "--duration" not in self.options

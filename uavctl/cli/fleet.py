@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -58,7 +59,9 @@ STATUS_PERIOD_S = 0.5  # between two requests for the status of all vehicles
 POLL_S = 0.1  # between two checks of their processes
 TABLE_PERIOD_S = 5.0  # between two tables where there is no terminal
 REST_S = 3.0  # longest time to come to rest in cells before the landing: a plan is 2.4 s long
-ORDERED = "x"  # before standard input of a daemon is closed: the end is ordered, not that of a killed fleet
+RUNS, ORDERED = b".", b"x"  # to standard input of a daemon: the fleet's process runs; the end is ordered
+# Without news of the fleet's process a daemon ends its flight: longer than a computer stands still that is only busy
+STANDSTILL_S = 20.0
 COORDINATOR_FILE = "coordinator.mcap"
 
 fleet_app = App(
@@ -159,6 +162,8 @@ def fly(
             is_time_over = duration is not None and not lasts_alone and time.monotonic() - begun_s >= duration
             reason = "ordered" if stopped() else "the time is over" if is_time_over else ""
             end.update(reason or _find_failure(flights, health))
+            for flight in flights:
+                flight.tell_running()
             time.sleep(POLL_S)
         for flight in flights:
             flight.join_output()
@@ -281,6 +286,8 @@ class FleetFlight:
             errors="replace",
             start_new_session=True,
         )
+        assert self._process.stdin is not None
+        os.set_blocking(self._process.stdin.fileno(), False)
         self._output_thread.start()
 
     def is_running(self) -> bool:
@@ -289,10 +296,16 @@ class FleetFlight:
 
     def request_fallback(self) -> None:
         """Request the end, as Ctrl-C does: the vehicle brakes, holds, and lands or is handed over."""
-        if self._process is not None and self._process.stdin is not None and not self._process.stdin.closed:
-            with suppress(OSError):  # the daemon has ended
-                self._process.stdin.write(ORDERED)
-                self._process.stdin.close()
+        self._write(ORDERED)
+
+    def tell_running(self) -> None:
+        """Tell the daemon that this process does not stand still."""
+        self._write(RUNS)
+
+    def _write(self, data: bytes) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):  # the daemon has ended, or stands still and has not read for hours
+                os.write(self._process.stdin.fileno(), data)
 
     def join_output(self) -> None:
         """Wait until the output of the daemon is printed, not for a child process that keeps it open."""
@@ -395,26 +408,37 @@ def coordinate(fleet: Fleet, parameters: CellParameters, path: Path) -> Iterator
         print_message(f"{path}: the recording lacks cycles ({recording.failure}); check the disk")
 
 
-def run_fleet_daemon(rest_s: float) -> None:
-    """Run the command line as a daemon of a fleet; raise Ctrl-C once standard input is closed.
-
-    The fleet closes it, or the system if the fleet's process is killed: then nothing supervises the spacing.
+def wait_for_end(descriptor: int, standstill_s: float) -> Literal["ordered", "killed", "stands still"]:
+    """Wait for the end of a flight, and return why it has come: nothing else supervises the spacing.
 
     Args:
-        rest_s: Time to come to rest in the last cell if the process is killed [s]; braking leaves a cell.
+        descriptor: Pipe from the fleet's process: a byte each 0.1 s, `ORDERED` for the end; it closes with the process.
+        standstill_s: Time without a byte after which the process counts as one that stands still [s].
+    """
+    # Without `sys.stdin`: this thread would hold its lock, and the interpreter would abort at its end.
+    while select.select([descriptor], [], [], standstill_s)[0]:
+        data = os.read(descriptor, 4096)
+        if not data:
+            return "killed"
+        if ORDERED in data:
+            return "ordered"
+    return "stands still"
+
+
+def run_fleet_daemon(rest_s: float) -> None:
+    """Run the command line as a daemon of a fleet; raise Ctrl-C once the fleet's process orders the end, or is gone.
+
+    Args:
+        rest_s: Time to come to rest in the last cell if the process is gone [s]; braking leaves a cell.
     """
 
-    def wait_for_close() -> None:
-        is_ordered = False
-        # Without `sys.stdin`: this thread would hold its lock, and the interpreter would abort at its end.
-        while os.read(0, 1):
-            is_ordered = True
-        if not is_ordered:
+    def end() -> None:
+        if wait_for_end(0, STANDSTILL_S) != "ordered":
             time.sleep(rest_s)
         signal.raise_signal(signal.SIGINT)
 
     try:
-        threading.Thread(target=wait_for_close, name="fleet", daemon=True).start()
+        threading.Thread(target=end, name="fleet", daemon=True).start()
         hide_health_lines()  # the fleet's table has the health of each vehicle
         main()
     except KeyboardInterrupt:  # before the command line answers signals
