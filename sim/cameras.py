@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.channel import is_within
 from sim.vehicle.interface import LEVEL, Quaternion, compute_heading_rad, rotate_to_body
-from uavctl.arrays import add
+from uavctl.arrays import sum_in_order
 from uavctl.config.connections import FrameConfig
 from uavctl.config.sim import CameraConfig
 from uavctl.errors import ConfigError
@@ -199,7 +199,7 @@ class Cameras:
 def _transform_axes(axes: tuple[Vec3, Vec3, Vec3], ned: Vec3) -> Vec3:
     if axes is AXES["right"]:
         return ned
-    north, east, down = (add(row * value for row, value in zip(rows, ned, strict=True)) for rows in axes)
+    north, east, down = (sum_in_order(row * value for row, value in zip(rows, ned, strict=True)) for rows in axes)
     return north, east, down
 
 

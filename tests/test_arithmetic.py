@@ -13,7 +13,7 @@ import pytest
 from places import without_pages
 
 from uavctl.arithmetic import CHOICE, OWN, PORTABLE, choose_arithmetic, without_choice
-from uavctl.arrays import add
+from uavctl.arrays import sum_in_order
 
 HASWELL = {"abm", "avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe", "sse4_2"}
 WIDE = {*HASWELL, "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
@@ -122,5 +122,5 @@ def test_a_flight_is_replayed_with_the_arithmetic_that_it_was_made_with_or_to_a_
 
 def test_a_sum_rounds_after_each_term_in_every_version_of_python() -> None:
     # Since Python 3.12 the sum of the first list is 1.0, that of the second one 1.0.
-    assert add([1e16, 1.0, -1e16]) == 0.0
-    assert add([0.1] * 10) == 0.9999999999999999
+    assert sum_in_order([1e16, 1.0, -1e16]) == 0.0
+    assert sum_in_order([0.1] * 10) == 0.9999999999999999

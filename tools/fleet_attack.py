@@ -6,7 +6,8 @@ the system permits that. Only processes that were started here are signalled.
 
     python tools/fleet_attack.py [--attack cameras-killed ...] [--rounds 1] [--json]
 
-Exit code 1: two vehicles collided, or one is still in the air at the end.
+Exit code 1: two vehicles collided, or one is still in the air at the end but for one that its pilot flies, or two never
+came near to each other, so that nothing was attacked.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Outcome:
     """What the true vehicles did."""
 
     attack: str
-    closest_m: float = np.inf  # of all pairs, from the attack on
+    closest_m: float | None = None  # of all pairs, from the attack on
     collisions: int = 0
     in_air: int = 0  # vehicles in the air at the end
     fleet_code: int | None = None  # exit code of `uavctl fleet fly`; None: it had to be killed
@@ -238,7 +239,7 @@ def attack(name: str, folder: Path) -> Outcome:
     with Scene(folder) as scene:
         scene.start("cameras", "cameras", "cross.toml")
         scene.start("fleet", "fleet", "fly", "cross.toml", "--arm", "--takeoff", "1.2", "--out", "flights")
-        begun_s, begins_m, end_s = time.monotonic(), None, None
+        begun_s, begins_m, end_s, closest_m = time.monotonic(), None, None, np.inf
         while True:
             time.sleep(0.02)
             now_s = time.monotonic() - begun_s
@@ -254,8 +255,8 @@ def attack(name: str, folder: Path) -> Outcome:
                 elif now_s > START_LIMIT_S:
                     break
                 continue
-            outcome.closest_m = min(outcome.closest_m, scene.measure_closest_m())
-            if outcome.landed_s is None and not scene.count_in_air():
+            closest_m = min(closest_m, scene.measure_closest_m())
+            if outcome.landed_s is None and scene.count_in_air() <= (1 if name == "pilot" else 0):
                 outcome.landed_s = now_s
             fleet = scene.processes["fleet"]
             if end_s is not None and now_s > end_s and name != "fleet-stopped" and fleet.poll() is None:
@@ -264,6 +265,7 @@ def attack(name: str, folder: Path) -> Outcome:
             is_ended = fleet.poll() is not None or name == "fleet-stopped"
             if (is_ended and outcome.landed_s is not None) or now_s > outcome.attacked_s + CROSS_S + END_LIMIT_S:
                 break
+        outcome.closest_m = closest_m if np.isfinite(closest_m) else None
         outcome.in_air, outcome.fleet_code = scene.count_in_air(), scene.processes["fleet"].poll()
     outcome.collisions = scene.collisions
     return outcome
@@ -282,13 +284,15 @@ def main(arguments: list[str]) -> int:
         if subprocess.run([*command[:2], "true"], check=False, capture_output=True).returncode == 0:
             os.execvpe(command[0], command, {**os.environ, "UAVCTL_NETWORK": "own"})
     has_failed = False
-    with tempfile.TemporaryDirectory(prefix="uavctl-") as short:  # sockets want short names
-        os.environ |= {"HOME": short, "XDG_RUNTIME_DIR": short, "PYTHONPATH": str(ROOT)}
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as short:  # locks of its own; sockets want short names
+        os.environ |= {"HOME": short, "XDG_RUNTIME_DIR": short, "TMPDIR": short, "PYTHONPATH": str(ROOT)}
         for number in range(options.rounds):
             for name in options.attack:
                 folder = (options.out or Path(short)).resolve() / f"{name}-{number}"
                 outcome = attack(name, folder)
-                has_failed = has_failed or outcome.collisions > 0 or outcome.in_air > 0
+                most_in_air = 1 if name == "pilot" else 0
+                has_failed = has_failed or outcome.collisions > 0 or outcome.in_air > most_in_air
+                has_failed = has_failed or outcome.attacked_s is None
                 fields = asdict(outcome)
                 text = json.dumps(fields) if options.json else ", ".join(f"{k} {v}" for k, v in fields.items())
                 print(text, flush=True)  # noqa: T201

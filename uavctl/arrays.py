@@ -15,6 +15,6 @@ Counts = NDArray[np.intp]
 SECOND_NS = 1_000_000_000
 
 
-def add(values: Iterable[float]) -> float:
+def sum_in_order(values: Iterable[float]) -> float:
     """Return the sum, added one by one: since Python 3.12 `sum` rounds floats otherwise, and a replay would differ."""
     return reduce(operator.add, values, 0.0)

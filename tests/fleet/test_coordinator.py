@@ -237,6 +237,15 @@ def test_a_cell_has_room_for_margins_up_to_a_limit(margin_m: float, room_m: floa
     np.testing.assert_allclose(place_m - cell.lower_m, room_m + PARAMETERS.margin_m, atol=2e-4)
 
 
+def test_vehicles_with_cells_of_another_coordinator_are_refused() -> None:
+    reports = [
+        Report(PlannedPath(0, np.tile(place_m, (STAGES, 1)), np.zeros((STAGES, 3))), np.zeros(3), 5, 6)
+        for place_m in STARTS_M[:2]
+    ]
+    with pytest.raises(ValueError, match="another coordinator"):
+        begin_without_cells(0, reports, PARAMETERS)
+
+
 def test_cells_leave_more_room_for_a_vehicle_that_refuses_them_until_it_takes_one() -> None:
     place_m = np.array([0.0, 0.0, -1.5])
     path = PlannedPath(0, np.tile(place_m, (STAGES, 1)), np.full((STAGES, 3), 2.0))

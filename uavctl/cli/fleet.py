@@ -310,6 +310,9 @@ class FleetFlight:
     def join_output(self) -> None:
         """Wait until the output of the daemon is printed, not for a child process that keeps it open."""
         self._output_thread.join(TABLE_PERIOD_S)
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
+            self._process.stdin = None
 
     def _print_output(self) -> None:
         assert self._process is not None and self._process.stderr is not None

@@ -142,7 +142,14 @@ def begin(step: int, positions_m: Array, goals_m: Array, parameters: CellParamet
 
 
 def begin_without_cells(step: int, reports: Sequence[Report], parameters: CellParameters) -> CoordinatorState:
-    """Begin with a report of each vehicle, none of which has a cell yet."""
+    """Begin with a report of each vehicle, none of which has a cell yet.
+
+    Raises:
+        ValueError: A vehicle uses a cell of another coordinator, whose sides no report has.
+    """
+    for number, report in enumerate(reports):
+        if report.in_use != NO_CELL:
+            raise ValueError(f"vehicle {number} uses a cell of another coordinator: let it land and begin anew")
     count, stages = len(reports), parameters.stages
     positions_m = [report.plan.mean_m[0] for report in reports]
     cells = [

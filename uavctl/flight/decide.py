@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.arrays import add
+from uavctl.arrays import sum_in_order
 from uavctl.fleet.cell import parse_cell
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias, remove_drag_from_bias
 from uavctl.flight.cells import add_cell, is_at_landing_place, leave_cells
@@ -392,7 +392,7 @@ def _find_velocity(biases: Biases, context: TickContext, supervised: Supervised)
     if observation is not None and observation.own_mps is not None:
         own = _select_known(observation.own_mps, plant)
         # It points against the other where v_own' v_predicted < 0
-        along = add(map(operator.mul, own, predicted))
+        along = sum_in_order(map(operator.mul, own, predicted))
         if judge_vehicle_velocity(observation).is_none:
             if along >= 0.0 or change.confirms_velocity(context.at_ns):
                 return own, True

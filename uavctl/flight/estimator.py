@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.arrays import Array, add
+from uavctl.arrays import Array, sum_in_order
 from uavctl.event_codes import EventCode
 from uavctl.flight.kalman import (
     Belief,
@@ -196,7 +196,7 @@ def average_vectors(vectors: Sequence[Vec3]) -> Vec3:
     """Return the mean of vectors, at least one."""
     n = len(vectors)
     # ā = Σ a_i / n
-    north, east, down = [add(values) / n for values in zip(*vectors, strict=True)]
+    north, east, down = [sum_in_order(values) / n for values in zip(*vectors, strict=True)]
     return north, east, down
 
 

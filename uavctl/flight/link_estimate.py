@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, betaincinv, ndtri
 
-from uavctl.arrays import add
+from uavctl.arrays import sum_in_order
 from uavctl.records import LinkEstimate
 
 
@@ -115,12 +115,12 @@ def compute_burst_statistic(counts: LinkCounts) -> float:
     more likely than after an arrival.
     """
     n00, n01, n10, n11 = counts.pairs
-    total = add(counts.pairs)
+    total = sum_in_order(counts.pairs)
     if not total:
         return 0.0
     row, column = (n00 + n01, n10 + n11), (n00 + n10, n01 + n11)
     cells = ((n00, row[0] * column[0]), (n01, row[0] * column[1]), (n10, row[1] * column[0]), (n11, row[1] * column[1]))
-    g2 = 2.0 * add([n * math.log(n * total / expected) for n, expected in cells if n])
+    g2 = 2.0 * sum_in_order([n * math.log(n * total / expected) for n, expected in cells if n])
     return math.copysign(math.sqrt(max(0.0, g2) * total / counts.squares), _compute_correlation(counts))
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 
-from uavctl.arrays import SECOND_NS, add
+from uavctl.arrays import SECOND_NS, sum_in_order
 from uavctl.frames import Quaternion, euler_from_quaternion
 from uavctl.mavlink.vehicle_turn import MotionSample, VehicleTurn, compute_down, wrap_angle
 from uavctl.records import Vec3
@@ -68,7 +68,7 @@ class AttitudeCheck:
             return False
         before_ns, before = self._accepted
         # |angle| = 2 arccos |q · p|
-        angle_rad = 2.0 * math.acos(min(abs(add(a * b for a, b in zip(attitude, before, strict=True))), 1.0))
+        angle_rad = 2.0 * math.acos(min(abs(sum_in_order(a * b for a, b in zip(attitude, before, strict=True))), 1.0))
         return angle_rad > NOISE_RAD + MAX_TURN_RPS * (captured_ns - before_ns) * 1e-9
 
     def _is_heading_right(
@@ -113,4 +113,4 @@ class AttitudeCheck:
 
 def _compute_angle(a: Vec3, b: Vec3) -> float:
     """Compute the angle between two directions [rad]."""
-    return math.acos(min(max(add(x * y for x, y in zip(a, b, strict=True)), -1.0), 1.0))
+    return math.acos(min(max(sum_in_order(x * y for x, y in zip(a, b, strict=True)), -1.0), 1.0))

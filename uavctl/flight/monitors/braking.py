@@ -14,7 +14,7 @@ import math
 import msgspec
 from msgspec.structs import replace
 
-from uavctl.arrays import add
+from uavctl.arrays import sum_in_order
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.motion import TickObservation
 from uavctl.flight.monitors.observation import read_vehicle_velocity
@@ -61,7 +61,7 @@ def update(
     speed_mps = math.hypot(*velocity)
     if state.began is None:
         # u' v > 0: the setpoint of the plan before still accelerates the vehicle
-        if add(u * v for u, v in zip(tick.sent_mps2, velocity, strict=True)) > 0.0:
+        if sum_in_order(u * v for u, v in zip(tick.sent_mps2, velocity, strict=True)) > 0.0:
             return state, NO_VERDICT
         return BrakingState((tick.at_ns, speed_mps), state.resumed_ns), NO_VERDICT
     since_ns, began_mps = state.began

@@ -23,7 +23,7 @@ from enum import Enum
 import msgspec
 from msgspec.structs import replace
 
-from uavctl.arrays import Array, add
+from uavctl.arrays import Array, sum_in_order
 from uavctl.flight.limits import ZERO
 from uavctl.records import Vec3
 
@@ -117,8 +117,8 @@ def _is_jump(track: JumpTrack, offset_m: Vec3, std_m: Array, age_s: float) -> bo
     if not min(math.hypot(*offset_m), math.hypot(*change)) > bound_m:
         return False
     # ν_0' Δν > c |Δν|²
-    grows = add(b * c for b, c in zip(track.offset_m, change, strict=True)) > GROWN_PART * add(c * c for c in change)
-    return not grows
+    along = sum_in_order(b * c for b, c in zip(track.offset_m, change, strict=True))
+    return not along > GROWN_PART * sum_in_order(c * c for c in change)
 
 
 def _confirm_jump(track: JumpTrack, offset_m: Vec3, jump_m: Vec3, at_ns: int) -> tuple[JumpTrack, Outcome]:

@@ -20,7 +20,7 @@ from statistics import median_low
 
 import msgspec
 
-from uavctl.arrays import add
+from uavctl.arrays import sum_in_order
 from uavctl.records import PositionSample, Vec3
 
 USUAL_STD_M = 0.012  # largest noise that the bounds of other monitors include
@@ -93,8 +93,8 @@ def _find_residual_m(middle: _Place, others: Sequence[_Place]) -> float:
     # r = p - Σ c_i p_i with c_i = Π_j t_j / (t_j - t_i), whose variance is (1 + Σ c_i²) σ²
     parts = [math.prod(t / (t - own) for t in times_ns if t != own) for own in times_ns]
     columns = zip(middle_m, *(place for _, place in others), strict=True)
-    away_m = [m - add(map(math.prod, zip(parts, places, strict=True))) for m, *places in columns]
-    return math.hypot(*away_m) / math.sqrt(1.0 + add(part * part for part in parts))
+    away_m = [m - sum_in_order(map(math.prod, zip(parts, places, strict=True))) for m, *places in columns]
+    return math.hypot(*away_m) / math.sqrt(1.0 + sum_in_order(part * part for part in parts))
 
 
 def _estimate_std_m(residuals_m: Sequence[float], largest: int) -> float:

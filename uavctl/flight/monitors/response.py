@@ -35,7 +35,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.arrays import Array, add
+from uavctl.arrays import Array, sum_in_order
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import TickObservation
@@ -296,7 +296,7 @@ def _sum_samples(numbers: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
     left = [[sample[1 + axis] - sample[4 + axis] for sample in numbers] for axis in range(3)]
     weighted = [list(map(operator.mul, weights, row)) for row in left]
     squares = [map(operator.mul, products, row) for products, row in zip(weighted, left, strict=True)]
-    return (add(weights), *map(add, weighted), *map(add, squares))
+    return (sum_in_order(weights), *map(sum_in_order, weighted), *map(sum_in_order, squares))
 
 
 def _compare(costs: list[float], group: _Group) -> tuple[float, str]:

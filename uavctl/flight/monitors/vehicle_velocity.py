@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from uavctl.arrays import add
+from uavctl.arrays import sum_in_order
 from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.engaged import MonitorState
 from uavctl.flight.monitors.motion import bound_gusts_mps
@@ -101,7 +101,7 @@ def judge_braking(observation: VelocityObservation) -> Verdict:
     known = [(v, other) for v, other in zip(own_mps, observation.predicted_mps, strict=True) if math.isfinite(other)]
     speed_mps, predicted_speed_mps = math.hypot(*own_mps), math.hypot(*(other for _, other in known))
     # v' v_predicted ≤ -½ |v| |v_predicted|: apart by 120° or more
-    is_opposed = add(v * other for v, other in known) <= -0.5 * speed_mps * predicted_speed_mps
+    is_opposed = sum_in_order(v * other for v, other in known) <= -0.5 * speed_mps * predicted_speed_mps
     is_faster = speed_mps >= began[1] + FASTER_MPS
     if not (is_opposed and is_faster) or min(speed_mps, predicted_speed_mps) < OPPOSED_MPS:
         return NO_VERDICT

@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from uavctl.arrays import Array, add
+from uavctl.arrays import Array, sum_in_order
 from uavctl.event_codes import EventCode
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.motion import PositionObservation, TickObservation, find_distance
@@ -299,9 +299,9 @@ def _remove_smoothing(off: list[float], change_mps: list[float]) -> list[float]:
 
 def _bound_delay_s(off: list[float], change_mps: list[float]) -> float:
     """Return the delay [s] by which smoothing may explain most of a change of offsets (3,) by that of the velocity."""
-    along = add([v * v for v in change_mps])
+    along = sum_in_order([v * v for v in change_mps])
     # τ = -Δo' Δv / Δv' Δv, within [0, τ_max]
-    delay_s = -add([o * v for o, v in zip(off, change_mps, strict=True)]) / along if along > 0.0 else 0.0
+    delay_s = -sum_in_order([o * v for o, v in zip(off, change_mps, strict=True)]) / along if along > 0.0 else 0.0
     return min(max(delay_s, 0.0), SMOOTHED_S)
 
 

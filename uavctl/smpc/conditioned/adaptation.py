@@ -29,7 +29,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from uavctl.arrays import Array, add
+from uavctl.arrays import Array, sum_in_order
 from uavctl.smpc.conditioned.backoffs import compute_violation_risk
 from uavctl.smpc.conditioned.reference import CERTIFICATE_LEVEL, find_nearest_level
 
@@ -178,8 +178,8 @@ def count_innovation(state: SpreadState, innovations: Sequence[float], variances
     The quotient of means gives weight to long silences: there coloured disturbances show, and W matters most.
     """
     # q <- q + 0.01 (Σ min(ν², 16 s²) - q),  p <- p + 0.01 (Σ s² - p),  v² = q / p
-    square = add(min(v * v, MOST_SQUARE * s) for v, s in zip(innovations, variances, strict=True))
-    variance = add(variances)
+    square = sum_in_order(min(v * v, MOST_SQUARE * s) for v, s in zip(innovations, variances, strict=True))
+    variance = sum_in_order(variances)
     before = state if state.variances > 0.0 else SpreadState(variance, variance)
     return SpreadState(
         before.squares + SPREAD_GAIN * (square - before.squares),

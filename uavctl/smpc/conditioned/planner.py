@@ -31,7 +31,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from uavctl.arrays import Array, add
+from uavctl.arrays import Array, sum_in_order
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import (
@@ -526,7 +526,7 @@ class ConditionedSolver:
             # x_0'P x_0 + |z|²
             of_part = dict(given_z)
             all_z = [z + of_part.pop(program, 0.0) for program, z in result.z_of_program]
-            cost = dx[0].dot(self._law.p).dot(dx[0]) + add([z.dot(z) for z in (*all_z, *of_part.values())])
+            cost = dx[0].dot(self._law.p).dot(dx[0]) + sum_in_order([z.dot(z) for z in (*all_z, *of_part.values())])
         else:
             # Σ_t (x_t - p_t)'Q_x(x_t - p_t) + (u_t - r_t)'Q_u(u_t - r_t) + x_H'P x_H
             last, dx, du = dx[-1], dx[:-1] - preview.path.states, du - preview.path.inputs

@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from msgspec import structs
 
-from uavctl.arrays import Array, add
+from uavctl.arrays import Array, sum_in_order
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite, relative_gap
@@ -101,7 +101,7 @@ def assemble(
         backoff_x[:, where.rows_x] = part.backoff_x
         backoff_u[:, where.rows_u] = part.backoff_u
         reference[where.states] = part.reference
-    cost, cost_lower = add(part.cost for _, part in parts), add(part.cost_lower for _, part in parts)
+    cost, cost_lower = sum_in_order(part.cost for _, part in parts), sum_in_order(part.cost_lower for _, part in parts)
     answer = Answer(
         seq=seq,
         status=status,
@@ -111,9 +111,9 @@ def assemble(
         backoff_x=backoff_x,
         backoff_u=backoff_u,
         reference=reference,
-        slack=add(part.slack for _, part in parts),
-        offset=add(part.offset for _, part in parts),
-        terminal_miss=add(part.terminal_miss for _, part in parts),
+        slack=sum_in_order(part.slack for _, part in parts),
+        offset=sum_in_order(part.offset for _, part in parts),
+        terminal_miss=sum_in_order(part.terminal_miss for _, part in parts),
         cost=cost,
         cost_lower=cost_lower,
         gap=relative_gap(cost, cost_lower),
