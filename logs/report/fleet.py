@@ -237,7 +237,7 @@ def _read_vehicles(paths: Iterable[Path], notes: list[str]) -> Iterator[Recorded
             notes.append(f"{path.parent.name} is not shown: {fault or error}")
             continue
         if fault:
-            notes.append(f"{path.parent.name} is shown up to {fault}")
+            notes.append(f"{path.parent.name} is shown in part: {fault}")
         yield vehicle
 
 
@@ -386,7 +386,7 @@ def _read_sender(path: Path, fleet: FleetRecording, notes: list[str]) -> ServedP
         notes.append(f"{SENDER} is not shown: it is of another flight")
         return None
     if sent.fault:
-        notes.append(f"{SENDER} is shown up to {sent.fault}")
+        notes.append(f"{SENDER} is shown in part: {sent.fault}")
     order = sorted(range(len(sent.names)), key=lambda number: _sort_key(sent.names[number]))
     return replace(
         sent,
