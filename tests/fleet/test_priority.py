@@ -123,6 +123,15 @@ def test_the_grid_fills_the_room_with_places_a_pitch_apart() -> None:
         assert lines[-1] == half_m
 
 
+def test_a_large_room_has_few_places_and_its_vehicles_arrive() -> None:
+    grid, rng = make_grid(np.full(3, -300.0), np.full(3, 300.0), 1.2), np.random.default_rng(9)
+    assert len(grid.places_m) <= 150  # of 250,000 that fit: the choice is made in each cycle
+    starts, goals = (rng.permutation(len(grid.places_m))[:6].tolist() for _ in range(2))
+    flown = fly_rounds(grid, starts, goals, 60)
+    assert flown[-1] == goals
+    check_hops(grid, flown)
+
+
 def test_a_room_for_one_place_has_one() -> None:
     assert make_grid(np.full(3, -0.6), np.full(3, 0.6), 1.2).places_m.tolist() == [[0.0, 0.0]]
 

@@ -28,6 +28,7 @@ from uavctl.fleet.boxes import ROUNDING_M
 
 WALL_M = 0.5  # from the walls to the places: plans keep their margins from walls, and get no nearer
 NEARER_M = 0.1  # less is noise
+MAX_LINES = 12  # of a grid, north or east: with more the choice takes longer than a cycle of the coordinator
 STUCK_S = 6.0  # twice the time in which two vehicles pass each other
 BLOCKED_M2 = 1e4  # cost of a place that an obstacle blocks: more than any way in a room, squared
 
@@ -86,10 +87,10 @@ class Grid:
 
 
 def make_grid(room_lower_m: Array, room_upper_m: Array, pitch_m: float) -> Grid:
-    """Make the places of a room, as many as fit."""
+    """Make the places of a room, as many as fit, up to `MAX_LINES` north and east."""
     lines_m = []
     for low_m, high_m in zip(room_lower_m[:2] + WALL_M, room_upper_m[:2] - WALL_M, strict=True):
-        count = 1 + int(max(high_m - low_m, 0.0) / pitch_m + ROUNDING_M)
+        count = min(1 + int(max(high_m - low_m, 0.0) / pitch_m + ROUNDING_M), MAX_LINES)
         lines_m.append(np.linspace(low_m, high_m, count) if count > 1 else np.array([0.5 * (low_m + high_m)]))
     north, east = (index.ravel() for index in np.indices((len(lines_m[0]), len(lines_m[1]))))
     hops = np.abs(north[:, None] - north) + np.abs(east[:, None] - east)
