@@ -22,6 +22,7 @@ from operation_rig import reserve_port
 from patience import wait_until
 from places import ROOT
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sender_recordings import open_sender_recording
 
 from logs.recording.reader import explain_missing_end
 from logs.recording.topics import SENT
@@ -355,3 +356,23 @@ def test_a_fleet_without_a_radio_is_refused(tmp_path: Path, capsys: pytest.Captu
     duo = ROOT / "docs" / "examples" / "duo.toml"
     assert run(["cameras", str(duo), "--out", str(tmp_path / "new")]) == 2
     assert "radio: is missing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--set", "link.loss=0.5", "--set", "sim.seed=2"), "--set link.loss=0.5"),
+        (("--topic", "/vehicle"), "--topic /vehicle"),
+        (("--system", "3"), "--system 3"),
+    ],
+    ids=["set", "topic", "system"],
+)
+def test_the_replay_of_a_sender_refuses_what_only_a_flight_takes(
+    options: tuple[str, ...], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "sender.mcap"
+    open_sender_recording(path, ("a", "b")).close()
+    assert run(["log", "replay", str(path), *options]) == 2
+    error = capsys.readouterr().err
+    assert named in error
+    assert str(path) in error

@@ -40,7 +40,11 @@ def replay(
     """Drive the recorded inputs through the same control loop and compare all that it decides."""
     if not 0.0 <= tolerance < 1.0:
         raise UsageError(f"--tolerance {tolerance:g}: it is a share of a number; give 0 or more, and less than 1")
-    if (kind := find_fleet_kind(flight)) and not (common.overrides or topic or system is not None):
+    if kind := find_fleet_kind(flight):
+        if unfit := [*(f"--set {override}" for override in common.overrides), *(f"--topic {name}" for name in topic)]:
+            raise UsageError(f"{flight}: a {kind} has no configuration or topics to choose; leave out {unfit[0]}")
+        if system is not None:
+            raise UsageError(f"{flight}: is the recording of a {kind}, not of a vehicle; leave out --system {system}")
         return _replay_fleet(flight, kind, common)
     packets = read_foreign_vehicle(flight, topic, system)
     if packets is not None:
