@@ -56,6 +56,15 @@ def test_runs_of_a_campaign_are_the_same_without_posix(other: dict[str, Any]) ->
 
 
 @pytest.mark.slow
+def test_the_doctor_names_what_is_missing_without_posix(other: dict[str, Any]) -> None:
+    items = {item["name"]: item for item in other["doctor"]["items"]}
+    assert not other["doctor"]["ok"]
+    assert items["system"]["state"] == "bad"
+    assert "fcntl.flock" in items["system"]["value"]
+    assert "scheduling" not in items
+
+
+@pytest.mark.slow
 def test_commands_of_recordings_and_of_virtual_time_work_without_posix(other: dict[str, Any]) -> None:
     assert set(other["commands"].values()) == {0}
 

@@ -108,6 +108,7 @@ def main(folder: Path) -> None:
                 "commands": commands,
                 "refused": refused,
                 "states": runs.states.tolist(),
+                "doctor": json.loads(run_command("doctor", "--json")[1]),
                 "is_page": flight.recording.path.with_suffix(".html").is_file(),
             }
         )

@@ -56,6 +56,7 @@ _COMMANDS = {
     "cameras": ("cameras:cameras", "Send the positions of all vehicles of a fleet over one channel with a budget."),
     "sim": ("sim:sim", "Run the simulated vehicle and cameras alone, for any MAVLink client."),
     "check": ("check:check", "Before take-off: rates, ages, frames, clocks, parameters, disk; never arms."),
+    "doctor": ("doctor:doctor", "Show whether this computer is fit to fly: libraries, rights, ports, clock, disk."),
     "design": ("design:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),
     "solve": ("design:solve", "Solve one decision problem, towards the configured target."),
     "identify": ("identify:identify_command", "Identify plant, lag, disturbance and link from a recording."),

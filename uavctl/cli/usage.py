@@ -31,6 +31,7 @@ EXAMPLES = {
     "cameras": "uavctl cameras radio.toml",
     "sim": "uavctl sim --config room-px4 --autopilot px4 --view",
     "check": "uavctl check --config my-room.toml --vehicle udpin://0.0.0.0:14540 --move",
+    "doctor": "uavctl doctor --config room-px4",
     "design": "uavctl design --config room",
     "init": "uavctl init --autopilot px4 --room 6x5x2.5",
     "solve": "uavctl solve --config paper --state 35,-2,-20,-4",
