@@ -1,6 +1,6 @@
 "use strict";
 // Draws the scenes of /scenes and the history of /history, and gives orders by /orders.
-const CAPACITY = 2000, COLOURS = 7, ANSWER_MS = 10000, NEAR_PX = 16, SILENCE_MS = 1000;
+const CAPACITY = 2000, COLOURS = 7, ANSWER_MS = 15000, NEAR_PX = 16, SILENCE_MS = 1000;
 const PLACE = ["north", "east", "height"]; // fields of the place to go to
 const byId = (id) => document.getElementById(id);
 const token = location.hash.slice(1);

@@ -236,7 +236,8 @@ def _open_page(
         )
         for flight, port in zip(flights, ports, strict=True)
     ]
-    with show_fleet_page(title, live_port, vehicles):
+    in_cells = any(flight.member.config.mission.cells for flight in flights)
+    with show_fleet_page(title, live_port, vehicles, REST_S if in_cells else 0.0):
         yield
 
 
