@@ -20,6 +20,7 @@ from uavctl.daemon.cell_exchange import CellExchange, ExchangedVehicle
 from uavctl.daemon.control_socket import ControlServer, open_listener
 from uavctl.daemon.flight_orders import FlightOrders
 from uavctl.daemon.health import Health
+from uavctl.fleet.cell import MovingCell
 from uavctl.lab.lockstep import LockstepFleet
 from uavctl.loop import ControlLoop
 from uavctl.records import FleetTruth, Ticked
@@ -86,6 +87,7 @@ def fly(folder: Path, stands_still_s: tuple[float, float]) -> tuple[Array, Array
     parameters, path = build_cell_parameters(configs, DISTANCE_M), folder / "coordinator.mcap"
     coordinator = Coordinator(parameters, 2)
     boxes: list[Array] = []
+    issued: dict[tuple[int, int], MovingCell] = {}  # by vehicle and number
     with ExitStack() as stack:
         daemons = []
         for number, (config, loop) in enumerate(zip(configs, fleet.loops, strict=True)):
@@ -104,17 +106,15 @@ def fly(folder: Path, stands_still_s: tuple[float, float]) -> tuple[Array, Array
 
         def wake(flown_s: float) -> bool:
             at_s = flown_s - 0.5 * STEP_S  # in the middle of the step
+            if coordinator.state is not None:
+                issued.update({(i, cell.number): cell for i, cell in enumerate(coordinator.state.newest)})
             if not stands_still_s[0] <= at_s < stands_still_s[1]:
                 exchange.wake(round(at_s * 1e9))
             elif at_s >= stands_still_s[0] + 0.2 and not boxes:  # nothing is on its way any more
-                assert coordinator.state is not None
-                for loop, new, old in zip(
-                    fleet.loops, coordinator.state.newest, coordinator.state.previous, strict=True
-                ):
+                for i, loop in enumerate(fleet.loops):
                     report = loop.report_cell()
                     assert report is not None
-                    cell = new if report.in_use == new.number else old
-                    assert report.in_use == cell.number
+                    cell = issued[i, report.in_use]
                     boxes.append(np.array([cell.lower_m[-1], cell.upper_m[-1]]))
             return True
 
