@@ -30,7 +30,7 @@ from uavctl.wiring.controller import build_flight_design, prepare
 STARTS_M = ((-1.2, 0.1, -0.2), (1.2, -0.1, -0.2))
 GOALS_M = np.array([[1.2, 0.0, -1.2], [-1.2, 0.0, -1.2]])
 DISTANCE_M = 0.35
-FLOWN_S, CROSSING_S = 16.0, 7.6  # they take off at 0.3 s, fly by plans from 6 s on, and pass each other at about 8 s
+FLOWN_S, CROSSING_S = 24.0, 7.6  # they take off at 0.3 s, fly by plans from 6 s on, and pass each other at about 8 s
 STEP_S = 0.05
 ROOM = (
     "limits.accel_mps2=[2,2,1.5]",
