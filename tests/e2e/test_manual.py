@@ -34,7 +34,7 @@ SHORTENED = (
 )
 # What is not typed, and why.
 OMITTED = {
-    r"^make |^\. \.venv|^python3 -m venv|^env/bin/": "sets up an environment: continuous integration is a `make test-all`",
+    r"^make |^\. \.venv|^python3 -m venv|^env/bin/": "sets up an environment: `make test-all` does",
     r"--move$": "a person has to move the body",
     r"^uavctl fly \.\.\.": "the dots are the reader's",
     r"--dask ": "needs a cluster",
