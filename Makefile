@@ -12,7 +12,7 @@ CLIENTS := .venv-clients
 ROS2 := .venv-ros2
 LOWEST := .venv-lowest
 
-.PHONY: fly test test-all test-long test-manual test-clients test-ros2 test-lowest mutation docs site clean
+.PHONY: fly test test-all test-long test-manual test-clients test-live test-ros2 test-lowest mutation docs site clean
 
 fly: $(FLIES)
 	$(VENV)/bin/uavctl loopback --udp --config room
@@ -41,7 +41,11 @@ test-clients: $(STAMP) $(CLIENTS)/.installed
 	UAVCTL_MAVSDK_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk/bin/python \
 	UAVCTL_MAVSDK3_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk3/bin/python \
 	UAVCTL_MAVPROXY_PYTHON=$(CURDIR)/$(CLIENTS)/mavproxy/bin/python \
-	$(VENV)/bin/python -m pytest -n 0 tests/clients
+	$(VENV)/bin/python -m pytest -n 0 tests/clients --ignore=tests/clients/test_live_browser.py
+
+# Buttons of the live page in a real browser, with a vehicle in real time: alone, as it needs the processor.
+test-live: $(STAMP)
+	$(VENV)/bin/python -m pytest -n 0 tests/clients/test_live_browser.py
 
 # Real nodes of ROS 2 over localhost, in an environment that has the extra: no other test needs it.
 test-ros2: $(ROS2)/.installed
