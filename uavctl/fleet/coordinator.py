@@ -311,12 +311,13 @@ def lead(
     level_m, level_goals_m = positions_m[:, :2], goals_m[:, :2]
     progress = follow_progress(known, level_m, level_goals_m, is_led, step, parameters.dt_s, ARRIVED_M)
     room = parameters.room_lower_m, parameters.room_upper_m
-    guides_m = choose_guides(positions_m, goals_m, Ways(parameters.distance_m, parameters.margin_m, *room))
-    if any(one.is_stuck for one in progress):
-        pitch_m = parameters.distance_m + 2.0 * (parameters.margin_m + parameters.max_margin_m)
-        waits = step - np.array([one.step for one in progress])
-        places_m = choose_places(level_m, level_goals_m, waits, is_led, make_grid(*room, pitch_m))
-        guides_m[is_led, :2] = places_m[is_led]
+    if not any(one.is_stuck for one in progress):
+        ways = Ways(parameters.distance_m, parameters.margin_m, *room)
+        return choose_guides(positions_m, goals_m, ways), progress
+    pitch_m = parameters.distance_m + 2.0 * (parameters.margin_m + parameters.max_margin_m)
+    waits = step - np.array([one.step for one in progress])
+    guides_m = goals_m.copy()
+    guides_m[:, :2] = choose_places(level_m, level_goals_m, waits, is_led, make_grid(*room, pitch_m))
     return guides_m, progress
 
 
