@@ -19,7 +19,7 @@ from uavctl.io.shared_sources import find_shared_sources
 from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.signing import FrameSigner, SigningKey, SigningTimestamps
 from uavctl.wiring.radio import RadioConfig
-from uavctl.wiring.sender import PositionSender, SentPosition
+from uavctl.wiring.sender import PositionMessage, PositionSender
 
 LIMIT_MS = 0.2
 PERIOD_NS, START_NS = 20_000_000, 1_000_000_000_000
@@ -62,7 +62,7 @@ def main() -> int:
         if given.signed:
             signer.sign(sent.frame, at_ns)
         sending_s.append(time.perf_counter() - last)
-        if isinstance(sent, SentPosition) and rng.random() > radio.loss:
+        if isinstance(sent, PositionMessage) and rng.random() > radio.loss:
             report = encoder.encode_position_report(sent.captured_ns // 1000, 1, 246, 197)
             sender.receive_reports(sent.vehicle, report, at_ns)
     result = {

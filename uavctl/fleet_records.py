@@ -107,7 +107,7 @@ class VehicleCycle(Record, frozen=True, kw_only=True):
     decided: int  # number of the newest cell that it took or refused
     newest: int  # number of its newest cell
     wait: str  # why it was issued none; empty if it was
-    land: bool  # whether it is told to land
+    land: bool  # whether it is ordered to land
     nearest: str  # vehicle whose claim is nearest to its own; empty without one
     gap: float | None  # of these claims over the distance to keep, the least of all stages; apart: at least 1
 

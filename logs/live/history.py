@@ -12,7 +12,7 @@ CAPACITY = 2000  # samples; a page draws all of them ten times a second
 PERIOD_S = 0.1  # of the samples at first: one for each scene
 
 
-class Sample(msgspec.Struct, frozen=True, array_like=True):
+class HistorySample(msgspec.Struct, frozen=True, array_like=True):
     """State in one period: the newest time and positions, and the largest age."""
 
     index: int  # number of the period
@@ -20,15 +20,15 @@ class Sample(msgspec.Struct, frozen=True, array_like=True):
     age_s: float | None
     places_m: dict[str, Vec3]  # local NED by name of the vehicle or body
 
-    def merge(self, later: Sample) -> Sample:
+    def merge(self, later: HistorySample) -> HistorySample:
         """Merge with a later sample of the same period."""
         ages_s = [age_s for age_s in (self.age_s, later.age_s) if age_s is not None]
-        return Sample(later.index, later.time_s, max(ages_s, default=None), {**self.places_m, **later.places_m})
+        return HistorySample(later.index, later.time_s, max(ages_s, default=None), {**self.places_m, **later.places_m})
 
 
 class _Document(msgspec.Struct, frozen=True):
     period_s: float
-    samples: list[Sample]
+    samples: list[HistorySample]
 
 
 class History:
@@ -40,7 +40,7 @@ class History:
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         self._capacity, self._period_s = capacity, PERIOD_S
-        self._samples: list[Sample] = []
+        self._samples: list[HistorySample] = []
 
     def add(self, time_s: float, age_s: float | None, places_m: Mapping[str, Vec3]) -> None:
         """Add a state; one of an earlier time begins a new flight."""
@@ -49,7 +49,7 @@ class History:
         self._push(self._samples, time_s, age_s, dict(places_m))
         while len(self._samples) > self._capacity:
             self._period_s *= 2.0
-            coarse: list[Sample] = []
+            coarse: list[HistorySample] = []
             for sample in self._samples:
                 self._push(coarse, sample.time_s, sample.age_s, sample.places_m)
             self._samples = coarse
@@ -58,8 +58,10 @@ class History:
         """Return the history as JSON."""
         return msgspec.json.encode(_Document(self._period_s, self._samples))
 
-    def _push(self, samples: list[Sample], time_s: float, age_s: float | None, places_m: dict[str, Vec3]) -> None:
-        sample = Sample(int(time_s / self._period_s), time_s, age_s, places_m)
+    def _push(
+        self, samples: list[HistorySample], time_s: float, age_s: float | None, places_m: dict[str, Vec3]
+    ) -> None:
+        sample = HistorySample(int(time_s / self._period_s), time_s, age_s, places_m)
         if samples and samples[-1].index == sample.index:
             samples[-1] = samples[-1].merge(sample)
         else:

@@ -54,7 +54,7 @@ class OrderSender:
 
     Args:
         sockets: Path of the control socket by name of the vehicle; empty where no orders are taken.
-        rest_s: Time to come to rest before several vehicles land: in cells, who brakes leaves its cell.
+        rest_s: Time to come to rest before several vehicles land: a vehicle in a cell that brakes leaves it.
     """
 
     def __init__(self, sockets: Mapping[str, str], rest_s: float = 0.0) -> None:

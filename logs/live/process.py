@@ -73,7 +73,7 @@ class LiveProcess(FeedProcess):
 
     @property
     def page_url(self) -> str:
-        """Address of the page; its fragment, which a browser sends to nobody, permits orders."""
+        """Address of the page; its fragment, which no browser sends, permits orders."""
         return f"http://localhost:{self.port}/{f'#{self.order_token}' if self._sockets else ''}"
 
     def _make_helper(self) -> HelperProcess:

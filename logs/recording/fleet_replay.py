@@ -1,6 +1,6 @@
 """Replays of a sender and of a coordinator: the recorded inputs give each choice, and each cell, again.
 
-Every record that comes out must be the recorded one, bit for bit. What differs first is told.
+Every record that comes out must be the recorded one, bit for bit. The first difference is reported.
 """
 
 from __future__ import annotations

@@ -224,12 +224,22 @@ def test_in_cells_all_come_to_rest_before_they_land(
             daemons.append(FakeDaemon(make_socket_path(Path(short), member.daemon), answer(ok=True, text="landing")))
             stack.callback(daemons[-1].close)
         daemons[0].may_answer.clear()
-        landing = threading.Thread(target=lambda: run(["fleet", "land", str(path)]))
-        landing.start()
-        wait_until(lambda: all(daemon.requests for daemon in daemons), "one that hangs delays no other")
-        assert [daemon.requests[0].ask for daemon in daemons] == [asked[0]] * 2
-        daemons[0].may_answer.set()
-        landing.join(LIMIT_S)
+        first: list[str] = []
+
+        def interrupt_and_answer() -> None:
+            wait_until(lambda: all(daemon.requests for daemon in daemons), "one that hangs delays no other")
+            first.extend(daemon.requests[0].ask for daemon in daemons)
+            os.kill(os.getpid(), signal.SIGINT)  # Ctrl-C leaves none without the order
+            daemons[0].may_answer.set()
+
+        helper = threading.Thread(target=interrupt_and_answer)
+        helper.start()
+        try:
+            assert run(["fleet", "land", str(path)]) == 0
+        except KeyboardInterrupt:
+            pytest.fail("Ctrl-C ended the command")
+        helper.join(LIMIT_S)
+        assert first == [asked[0]] * 2
         assert [[request.ask for request in daemon.requests] for daemon in daemons] == [asked] * 2
 
 

@@ -25,7 +25,7 @@ from uavctl.schedule.ages import compute_periodic_tail
 from uavctl.schedule.scheduler import ScheduleName
 from uavctl.wiring.controller import build_flight_design, prepare
 from uavctl.wiring.radio import RadioConfig, compute_slot_ns, make_link_overrides
-from uavctl.wiring.sender import PositionSender, SentAnswer, SentPosition
+from uavctl.wiring.sender import PositionMessage, PositionSender, SentAnswer
 
 FRAME_BYTES = 44
 LOSSES = (0.3, 0.0, 0.0)
@@ -154,11 +154,11 @@ class WatchedSender(PositionSender):
     def __init__(self, configs: Sequence[Config], radio: RadioConfig) -> None:
         sources = find_shared_sources([f"udpin://0.0.0.0:{14600 + number}" for number in range(len(configs))])
         super().__init__(configs, sources, radio, spacing_m=0.0, start_ns=0, keeps_stamps=True)
-        self.messages: list[tuple[int, SentPosition]] = []
+        self.messages: list[tuple[int, PositionMessage]] = []
 
-    def send_next(self, at_ns: int) -> SentPosition | SentAnswer | None:
+    def send_next(self, at_ns: int) -> PositionMessage | SentAnswer | None:
         sent = super().send_next(at_ns)
-        if isinstance(sent, SentPosition):
+        if isinstance(sent, PositionMessage):
             self.messages.append((at_ns, sent))
         return sent
 

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sender_rig import Air
 
 from uavctl.mavlink.encoder import Encoder
-from uavctl.wiring.sender import PositionSender, SentPosition
+from uavctl.wiring.sender import PositionMessage, PositionSender
 
 BEGIN_NS = 2_000_000_000  # both vehicles are in motion
 SECOND_NS = 1_000_000_000
@@ -58,7 +58,7 @@ class _OtherClock:
 
     def send_next(self, at_ns: int) -> Any:
         sent = self._sender.send_next(at_ns)
-        if not isinstance(sent, SentPosition):
+        if not isinstance(sent, PositionMessage):
             return sent
         message = read_message(sent.frame)
         angles = message.roll, message.pitch, message.yaw

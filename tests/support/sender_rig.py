@@ -24,7 +24,7 @@ from uavctl.mavlink.connection import MOCAP
 from uavctl.records import ControlMode, Outgoing, Received, Record, Send, Truth, Vec3
 from uavctl.wiring.controller import Prepared, build_flight_design, prepare
 from uavctl.wiring.radio import RadioConfig, make_link_overrides
-from uavctl.wiring.sender import PositionSender, SentPosition
+from uavctl.wiring.sender import PositionMessage, PositionSender
 
 SPACING_M = 0.4
 RADIO = RadioConfig(bytes_per_s=5760.0, rate_hz=50.0, loss=0.3, feedback_s=0.2)
@@ -144,7 +144,7 @@ class Air:
         sent = sender.send_next(self._now_ns)
         if sent is None:
             return False
-        if isinstance(sent, SentPosition):
+        if isinstance(sent, PositionMessage):
             self.sent.append((self._now_ns, sent.vehicle))
         if self._rng.random() >= self.radio.loss:
             for delay_ns, changed in self.to_vehicle(sent.vehicle, sent.frame, self._now_ns):

@@ -28,7 +28,7 @@ from uavctl.wiring.radio import (
     compute_slot_ns,
     compute_vehicle_costs,
 )
-from uavctl.wiring.sender import UNUSED, PositionSender, SentPosition
+from uavctl.wiring.sender import UNUSED, PositionMessage, PositionSender
 
 START_NS = 1_000_000_000_000
 RADIO = RadioConfig(bytes_per_s=5760.0, rate_hz=50.0)
@@ -71,7 +71,7 @@ def test_a_daemon_reads_the_pose_and_the_stamp_of_the_cameras(message: str, fram
         at_ns, data = captured
         sender.receive_positions(0, data, at_ns)
         sent = sender.send_next(at_ns)
-        assert isinstance(sent, SentPosition) and len(sent.frame) <= 44
+        assert isinstance(sent, PositionMessage) and len(sent.frame) <= 44
         (expected,), _ = receive(direct[MOCAP], data, at_ns)
         (sample,), _ = receive(served[MOCAP], sent.frame, at_ns)
         assert sample.position_m == pytest.approx(position_m, abs=1e-5)
@@ -92,7 +92,7 @@ def test_reports_of_a_daemon_tell_a_lost_message_from_one_that_arrived() -> None
         at_ns, data = captured
         sender.receive_positions(0, data, at_ns)
         sent = sender.send_next(at_ns)
-        assert isinstance(sent, SentPosition)
+        assert isinstance(sent, PositionMessage)
         ages_s.append(sent.ages_s[0])
         if number != 3:  # the fourth message is lost
             (_,), replies = receive(link, sent.frame, at_ns + 1_000_000)
@@ -157,7 +157,7 @@ def test_bodies_of_one_port_go_to_the_vehicles_that_name_them() -> None:
         sender.receive_positions(0, make_vision(system, 1000 + system, 0.1 * system), START_NS)
     norths_m, at_ns = {}, START_NS
     while (sent := sender.send_next(at_ns)) is not None:
-        assert isinstance(sent, SentPosition)
+        assert isinstance(sent, PositionMessage)
         ((sample,), _) = receive(make_links(configs[sent.vehicle])[MOCAP], sent.frame, at_ns)
         norths_m[sent.vehicle] = sample.position_m[0]
         at_ns += 10_000_000
@@ -212,7 +212,7 @@ def test_a_flood_of_time_requests_keeps_budget_and_wait() -> None:
                 sender.receive_positions(number, captured[1], at_ns)
             sender.receive_reports(number, encoder.encode_timesync(0, at_ns), at_ns)
         sent = sender.send_next(at_ns)
-        if isinstance(sent, SentPosition):
+        if isinstance(sent, PositionMessage):
             total_bytes += sent.wire_bytes
             # The test asks each millisecond.
             assert at_ns - sent_ns.get(sent.vehicle, at_ns) <= wait_ns + 1_000_000
@@ -235,7 +235,7 @@ def test_what_a_source_asks_or_answers_unasked_has_no_effect() -> None:
         sender.receive_positions(0, answer, START_NS + 2)
     sender.receive_positions(0, make_vision(17, 1_000_000, 0.5), START_NS + 1000)
     sent = sender.send_next(START_NS + 1000)
-    assert isinstance(sent, SentPosition)
+    assert isinstance(sent, PositionMessage)
     assert sent.captured_ns == START_NS + 1000 - round(make_config().clock.latency_s * 1e9)
 
 

@@ -30,7 +30,7 @@ from uavctl.io.signed_connection import make_admission_rules, sign_sender
 from uavctl.io.sources import open_bodies
 from uavctl.io.transport import open_connection, wait
 from uavctl.mavlink.connection import MOCAP
-from uavctl.wiring.sender import PositionSender, SentPosition
+from uavctl.wiring.sender import PositionMessage, PositionSender
 
 SENT_MESSAGE = "VISION_POSITION_ESTIMATE"
 REPORT_NS = 200_000_000  # between two looks at what people should know
@@ -116,7 +116,7 @@ class _Run:
         sent = self._sender.send_next(at_ns)
         if sent is not None:
             self._targets[sent.vehicle].send(sent.frame)
-        if isinstance(sent, SentPosition):
+        if isinstance(sent, PositionMessage):
             self._recording.add(at_ns, sent.vehicle, sent.captured_ns, sent.wire_bytes, sent.ages_s)
         for number, source in enumerate(self._sources):
             request = self._sender.make_time_request(number, at_ns)

@@ -195,11 +195,13 @@ def status(
 def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None) -> int:
     """Land all vehicles of a file; those in cells first come to rest. Exit code 1: not all of them take the order."""
     fleet, folder, all_accepted = read_fleet(file), find_control_folder(control), True
-    if fleet.cells is not None:  # who brakes leaves its cell
-        print_message(f"all vehicles come to rest in their cells for {REST_S:g} s", highlight=False)
-        _ask_all(fleet.members, folder, "hold")
-        time.sleep(REST_S)
-    for member, reply in zip(fleet.members, _ask_all(fleet.members, folder, "land"), strict=True):
+    with stop_on_signals():  # Ctrl-C while they come to rest leaves none without the order to land
+        if fleet.cells is not None:  # a vehicle that brakes leaves its cell
+            print_message(f"all vehicles come to rest in their cells for {REST_S:g} s", highlight=False)
+            _ask_all(fleet.members, folder, "hold")
+            time.sleep(REST_S)
+        replies = _ask_all(fleet.members, folder, "land")
+    for member, reply in zip(fleet.members, replies, strict=True):
         if isinstance(reply, NotReachedError):
             verdict, text = "not reached", str(reply)
         else:

@@ -80,7 +80,7 @@ def limit_ticks(engaged_limit_s: float = LIMIT_S) -> Iterator[TickLimit]:
         engaged_limit_s: of a tick while the vehicle flies the setpoints [s].
     """
     limit, main_thread = TickLimit(engaged_limit_s), threading.main_thread()
-    # The only signal that is ignored where nobody handles it, and that no timer sends.
+    # The only signal that is ignored without a handler, and that no timer sends.
     previous = signal.signal(signal.SIGURG, limit.handle_signal)
     try:
         watcher = threading.Thread(target=limit.watch, args=(main_thread.ident,), name="tick limit", daemon=True)

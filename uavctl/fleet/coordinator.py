@@ -149,7 +149,9 @@ def begin_without_cells(step: int, reports: Sequence[Report], parameters: CellPa
     """
     for number, report in enumerate(reports):
         if report.in_use != NO_CELL:
-            raise ValueError(f"vehicle {number} uses a cell of another coordinator: let it land and begin anew")
+            raise ValueError(
+                f"vehicle {number} uses a cell of another coordinator: land it, then start the fleet again"
+            )
     count, stages = len(reports), parameters.stages
     positions_m = [report.plan.mean_m[0] for report in reports]
     cells = [

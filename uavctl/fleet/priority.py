@@ -12,7 +12,7 @@ On a grid of two or more rows and columns with a free place, the first one advan
 place that a way without the first one's place leads to, and one place does not part such a grid.
 
 Source: K. Okumura et al., Priority inheritance with backtracking for iterative multi-agent path finding (Artificial
-Intelligence 310, 2022), without rings, and with goals beside the grid.
+Intelligence 310, 2022), without rings, and with goals off the grid.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ class _Search:
         at: Place where each vehicle is (N,).
         hops: Hops from each place to each goal (N, V + N).
         links: Whether a hop leads from one place to another.
-        near: Places that nobody may be at while one is at a place.
+        near: Places that stay empty while a vehicle is at a place.
         movable: Vehicles that follow.
     """
 

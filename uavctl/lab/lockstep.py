@@ -24,7 +24,7 @@ from uavctl.loop import ControlLoop
 from uavctl.records import ClosestApproach, Collision, FleetTruth, Received, Send, Ticked, Truth, VehicleTruth
 from uavctl.wiring.controller import Prepared
 from uavctl.wiring.radio import RadioConfig, find_radio_problems
-from uavctl.wiring.sender import PositionSender, SentAnswer, SentPosition
+from uavctl.wiring.sender import PositionMessage, PositionSender, SentAnswer
 
 _DATAGRAMS = "udpin://0.0.0.0:{}"  # URL of the cameras of a vehicle: each datagram is whole
 TRUTH = "/sim/truth"
@@ -165,10 +165,10 @@ class RecordedSender:
         )
         sender.watch = self._recording
 
-    def send_next(self, at_ns: int) -> SentPosition | SentAnswer | None:
+    def send_next(self, at_ns: int) -> PositionMessage | SentAnswer | None:
         """Return the message that goes out now, and record a position; see `PositionSender`."""
         sent = self._sender.send_next(at_ns)
-        if isinstance(sent, SentPosition):
+        if isinstance(sent, PositionMessage):
             self._recording.add(at_ns, sent.vehicle, sent.captured_ns, sent.wire_bytes, sent.ages_s)
         return sent
 

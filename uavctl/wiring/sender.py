@@ -56,8 +56,8 @@ _PING = MessageLayout(mavlink.MAVLink_ping_message)
 _TIMESYNC = MessageLayout(mavlink.MAVLink_timesync_message)
 
 
-class SentPosition(NamedTuple):
-    """A position on its way."""
+class PositionMessage(NamedTuple):
+    """Message with a position, as it was sent."""
 
     vehicle: int  # number of its vehicle
     captured_ns: int  # time of capture [ns]
@@ -155,7 +155,7 @@ class PositionSender:
     Attributes:
         refused: Counts of positions that were not used, by reason.
         parameters: Constants of the schedule.
-        watch: Gets what the choices come from; None: nobody.
+        watch: Gets what the choices come from; None: no receiver.
 
     Args:
         configs: Configuration of each vehicle.
@@ -261,7 +261,7 @@ class PositionSender:
         """Return the time until the channel is free [ns]."""
         return self._channel.compute_remaining_ns(at_ns)
 
-    def send_next(self, at_ns: int) -> SentPosition | SentAnswer | None:
+    def send_next(self, at_ns: int) -> PositionMessage | SentAnswer | None:
         """Return what goes out now; None if the channel is occupied, or there is nothing to send."""
         if not self._channel.is_free(at_ns):
             return None
@@ -288,7 +288,7 @@ class PositionSender:
         wire_bytes = len(frame) + self._signature_bytes
         self._channel.occupy(at_ns, wire_bytes)
         self.sent[number] += 1
-        return SentPosition(number, captured_ns, frame, wire_bytes, tuple(self._scheduler.ages_s))
+        return PositionMessage(number, captured_ns, frame, wire_bytes, tuple(self._scheduler.ages_s))
 
     def _answer_request(self, at_ns: int) -> SentAnswer | None:
         """Return an answer to the vehicle that has waited longest for one; None while none may go out.
