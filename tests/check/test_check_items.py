@@ -68,6 +68,14 @@ def test_the_rate_is_that_of_the_cameras_whatever_the_link_loses(rate_hz: float,
     assert found["position rate"].ok == good
 
 
+def test_a_sender_of_several_vehicles_leaves_positions_out() -> None:
+    turns = ["link.model=scheduled", "sim.camera.rate_hz=50", "source.rate_hz=50", "link.loss=0.3"]
+    for seed in range(4):
+        found = run_check([*turns, "link.wait_s=0.07", f"sim.seed={seed}"], seconds=8.0)
+        assert found["position rate"].ok, found["position rate"]
+    assert not run_check([*turns, "link.wait_s=0.2"], ["link.wait_s=0.07"], seconds=8.0)["position rate"].ok
+
+
 def test_more_loss_than_the_design_counts_on_fails_and_chance_does_not() -> None:
     for seed in range(8):
         more = ["link.loss=0.3", f"sim.seed={seed}", "sim.camera.rate_hz=5.0"]

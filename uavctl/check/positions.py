@@ -97,18 +97,19 @@ def _estimate_period_s(captured_s: list[float]) -> float | None:
 def _check_rate(samples: list[Sample], period_s: float | None, config: Config) -> Item:
     """Judge the rate of captures, and show that of arrivals, by our clock."""
     arrivals_s = sorted(sample.received_ns * 1e-9 for sample in samples)
-    required_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
-    min_hz, reason = (
-        _MIN_RATE_SHARE * required_hz,
-        f"{_MIN_RATE_SHARE:.0%} of source.rate_hz, or of one each plant.dt_s",
-    )
+    span_s = max(arrivals_s[-1] - arrivals_s[0], 1e-9)
+    required_hz, loss = config.arrival_rate_hz, config.link.loss
+    source = "link.wait_s" if config.link.model == "scheduled" else "source.rate_hz, or of one each plant.dt_s"
+    min_hz, reason = _MIN_RATE_SHARE * required_hz, f"{_MIN_RATE_SHARE:.0%} of {source}"
     if period_s is None:
-        min_hz, reason = min_hz * (1.0 - config.link.loss), f"{reason}, less link.loss"
+        # Of n positions n (1 - p) arrive, with the variance n p (1 - p): a right link is refused once in 700 checks
+        mean, std = required_hz * (1.0 - loss), math.sqrt(required_hz * loss * (1.0 - loss) / span_s)
+        min_hz, reason = min(min_hz * (1.0 - loss), mean - 3.0 * std), f"{reason}, less link.loss"
     want = f"at least {min_hz:.3g} Hz ({reason})"
     if len(arrivals_s) <= _MIN_SAMPLES:
         value = f"only {len(arrivals_s)} positions came"
         return make_item("position rate", ItemState.BAD, value, want, "listen longer, or check the source")
-    arrival_hz = (len(arrivals_s) - 1) / max(arrivals_s[-1] - arrivals_s[0], 1e-9)
+    arrival_hz = (len(arrivals_s) - 1) / span_s
     if period_s is None:
         is_good, value = arrival_hz >= min_hz, "irregular captures"
     else:

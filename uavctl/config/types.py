@@ -407,3 +407,10 @@ class Config(Section, frozen=True, kw_only=True):
     def is_age_conditioned(self) -> bool:
         """Whether plans are made by the scheme with risk conditioned on the age."""
         return self.smpc.is_age_conditioned
+
+    @property
+    def arrival_rate_hz(self) -> float:
+        """Least rate of positions on the link without losses: a sender of several vehicles leaves most of them out."""
+        if self.link.model == "scheduled":
+            return 1.0 / self.link.wait_s
+        return self.source.rate_hz or 1.0 / self.plant.dt_s

@@ -136,7 +136,7 @@ class HealthMonitor:
         )
         self._speed_axes = tuple(zip(config.plant.axes, speed_indices, strict=True))
         self._ticked: Ticked | None = None  # the last tick
-        self._rate_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
+        self._rate_hz = config.arrival_rate_hz
         self._position_count = 0  # positions, since the start
         self._count_history: deque[tuple[int, int]] = deque(maxlen=LOSS_PERIODS + 1)  # at_ns, count; once a period
         self._loss: float | None = None
