@@ -81,6 +81,7 @@ def summarize(results: list[SwapResult]) -> dict[str, float]:
         "collisions": sum(result.collisions for result in results),
         "closest": min(result.closest for result in results),
         "near_share": sum(result.near_share for result in results) / len(results),
+        "outside_share": sum(result.outside_share for result in results) / len(results),
         "finish_ratio": median(ratios) if ratios else math.nan,
         "finish_ratio_max": max(ratios, default=math.nan),
         "exits": sum(result.exits for result in results),

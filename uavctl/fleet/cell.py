@@ -50,6 +50,11 @@ class MovingCell:
         index = np.clip(index, 0, len(self.lower_m) - 1)
         return self.lower_m[index].max(axis=1), self.upper_m[index].min(axis=1)
 
+    def find_box(self, step: float) -> tuple[Array, Array]:
+        """Find the box (3,), (3,) that holds at a time [steps]."""
+        index = min(max(math.floor(step - self.step + STEP_TOLERANCE), 0), len(self.lower_m) - 1)
+        return self.lower_m[index], self.upper_m[index]
+
     def compute_excess_m(self, step: int, plan: PlannedPath) -> Array:
         """Compute how far a plan with its margins is outside in stages 1 … H, (H, 3) [m]; 0 is inside."""
         plan = plan.advance(step)

@@ -55,7 +55,7 @@ class CellParameters:
     stages: int  # S, boxes of a cell: one more than the steps of a plan
     # Room around a plan for its changes while a cell is on its way. With less, vehicles refuse more cells; with more,
     # two vehicles pass at a larger distance
-    margin_m: float = 0.06
+    margin_m: float = 0.1
     shift_stages: int = (
         6  # change of the age of a position until a cell is decided about: three lost positions of 20 Hz
     )

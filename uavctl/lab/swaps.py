@@ -83,6 +83,7 @@ class SwapResult:
     straight_s: float  # time of the longest way, alone and without disturbance
     closest: float  # least distance of a pair over the stated one: horizontal, or vertical over `DOWNWASH`
     near_share: float  # share of the truths of a pair below the stated distance
+    outside_share: float  # share of the truths of a vehicle with a cell that are outside of it
     collisions: int
     exits: int  # times that vehicles left their cells
     landings: int  # vehicles told to land
@@ -230,7 +231,7 @@ class Swap:
         self.traffic = CellTraffic(case, self.fleet, self.parameters)
         self._dt_ns = round(self.parameters.dt_s * SECOND_NS)
         self.closest = np.full(math.comb(case.vehicles, 2), np.inf)
-        self.near = self.pairs = 0
+        self.near = self.pairs = self.outside = self.in_cells = 0
         self.away_s = np.zeros(case.vehicles)  # when each vehicle was last away from its goal
 
     @property
@@ -264,6 +265,12 @@ class Swap:
         self.closest = np.minimum(self.closest, distances)
         self.near += int((distances < 1.0).sum())
         self.pairs += distances.size
+        for loop, position_m in zip(self.fleet.loops, positions_m, strict=True):
+            cell = loop.cell_choice.cell
+            if cell is not None:
+                lower_m, upper_m = cell.find_box(flown_s / self.parameters.dt_s)
+                self.in_cells += 1
+                self.outside += bool(((position_m < lower_m) | (position_m > upper_m)).any())
         self.away_s[np.linalg.norm(positions_m - self.goals_m, axis=1) > NEAR_M] = flown_s
 
     def _summarize(self) -> SwapResult:
@@ -277,6 +284,7 @@ class Swap:
             straight_s=compute_straight_time_s(self.begins_m, self.goals_m, self.parameters),
             closest=float(self.closest.min(initial=np.inf)),
             near_share=self.near / max(self.pairs, 1),
+            outside_share=self.outside / max(self.in_cells, 1),
             collisions=len(self.fleet.collisions),
             exits=sum(choice.exits for choice in choices),
             landings=len(self.traffic.landed),

@@ -59,8 +59,8 @@ class Preview(msgspec.Struct, frozen=True, eq=False):
     widening: float = 1.0  # factor of all standard deviations of the rows
     silence_widening: float = 1.0  # further factor of those of information H steps old
 
-    # Right sides of the state rows (m_x,) where the plan rests, for a cell those of its last box; None: the tightest
-    # ones of all stages
+    # Right sides of the state rows (m_x,) where the plan rests: those of a moving cell's last box; None: the tightest
+    # ones of all stages, and no moving cell
     resting_limits: Array | None = None
 
     @property

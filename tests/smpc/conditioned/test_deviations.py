@@ -10,7 +10,7 @@ from baseline_rig import problem
 
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman, settle_covariance
-from uavctl.smpc.conditioned.backoffs import RowDeviations, bound_widening, find_opposite_rows
+from uavctl.smpc.conditioned.backoffs import WIDENED_SHARE, RowDeviations, find_opposite_rows, fit_deviations
 from uavctl.smpc.estimate import add_bias, innovation_form
 from uavctl.smpc.nominal import find_parts
 from uavctl.wiring.controller import build_conditioned, build_controller, build_estimator, build_problem
@@ -80,8 +80,8 @@ def test_widened_back_offs_leave_half_of_the_room_between_opposite_limits() -> N
     opposite = find_opposite_rows(c)
     assert opposite.tolist() == [[0, 2]]
     for narrower in (0.3 * plain, plain):
-        assert bound_widening(narrower, plain, quantiles, b, opposite).tolist() == narrower.tolist()
-    bounded = bound_widening(4.0 * plain, plain, quantiles, b, opposite)
+        assert fit_deviations(narrower, quantiles, b, opposite, WIDENED_SHARE, plain).tolist() == narrower.tolist()
+    bounded = fit_deviations(4.0 * plain, quantiles, b, opposite, WIDENED_SHARE, plain)
     assert bounded[:, [1, 3]].tolist() == (4.0 * plain)[:, [1, 3]].tolist()
     is_bounded = []
     for stage in range(steps):

@@ -49,6 +49,9 @@ RARE_SHARE = 0.05  # share of the allowed risk that the oldest ages, without bac
 # Share of the room between opposite limits that widened back-offs may take. A spread that takes more tells of a wrong
 # model, and plans that have to be at rest within it brake too hard
 WIDENED_SHARE = 0.5
+# Share of the room of a moving cell that back-offs may take: a plan needs the rest. The room is the back-offs' with
+# 0.1 m to each side, so they keep up to 0.4 m in a cell made for them
+CELL_SHARE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,24 +181,29 @@ def find_opposite_rows(c: Array) -> Index:
     return np.array([rows for rows in pairs if len(rows) == 2], dtype=np.intp).reshape(-1, 2)
 
 
-def bound_widening(sigma: Array, plain: Array, quantiles: Array, b: Array, opposite: Index) -> Array:
-    """Bound widened deviations so that their back-offs leave room between opposite limits.
+def fit_deviations(
+    sigma: Array, quantiles: Array, sides: Array, opposite: Index, share: float, least: Array | float = 0.0
+) -> Array:
+    """Reduce deviations where the back-offs of opposite rows would take more than a share of the room between them.
 
     Args:
-        sigma: Widened standard deviations (H, m).
-        plain: Those of before (H, m).
+        sigma: Standard deviations (H, m).
         quantiles: Standard deviations (H, 1) that a row keeps.
-        b: Right sides (m,).
+        sides: Right sides of the rows, of all stages (m,) or each (H, m).
         opposite: Pairs (n, 2) of opposite rows.
+        share: Largest share.
+        least: Standard deviations (H, m) that nothing reduces.
     """
     first, second = opposite.T
-    # s (β_ti + β_tj) <= max(β⁰_ti + β⁰_tj, (b_i + b_j) / 2), with β = κ σ and s <= 1
-    widened, least = (quantiles * (values[:, first] + values[:, second]) for values in (sigma, plain))
-    most = np.maximum(least, WIDENED_SHARE * (b[first] + b[second]))
-    is_beyond = widened > most
+    # s κ (σ_ti + σ_tj) <= max(κ (σ⁰_ti + σ⁰_tj), share (b_i + b_j)), with s <= 1
+    taken = quantiles * (sigma[:, first] + sigma[:, second])
+    most = share * (sides[..., first] + sides[..., second])
+    if not isinstance(least, float):
+        most = np.maximum(most, quantiles * (least[:, first] + least[:, second]))
+    is_beyond = taken > most
     if not np.count_nonzero(is_beyond):
         return sigma
-    scale = np.divide(most, widened, out=np.ones_like(widened), where=is_beyond)
+    scale = np.divide(most, taken, out=np.ones_like(taken), where=is_beyond)
     bounded = sigma.copy()
     bounded[:, first] *= scale
     bounded[:, second] *= scale

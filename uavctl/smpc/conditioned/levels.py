@@ -9,6 +9,8 @@
    expected cost is V(x_0) + Σ_t s_t |z_t|². So a plan moves away from a limit in the stages of old information, and a
    plan that is soon replaced stays at its target. Plans of observed links use these weights beside limits, where the
    regulator's mean rests within the limits: a new position frees a plan from back-offs, but not from other limits.
+5. A moving cell is as narrow as other vehicles leave it. Its plans have equal budgets, and none for the rarest ages, of
+   the observed link: back-offs for these would need more room than most cells have, and plans would have slack.
 """
 
 from __future__ import annotations
@@ -87,6 +89,7 @@ class RiskLevel:
 
     near: Allocation  # beside limits
     motion: Allocation  # along motions, whose plans meet limits at any age
+    cell: Allocation  # in moving cells
     far: Array  # distance (m,) of a target from each row beyond which it is far from it
     transit_bounds: Array  # bounds on a target far from limits, without limits of a preview and widening
 
@@ -171,12 +174,15 @@ class RiskLevels:
             reference_backoffs,
         )
 
-    def _make_level(self, near: Allocation, risk: AgeRisk, motion: Allocation | None = None) -> RiskLevel:
+    def _make_level(
+        self, near: Allocation, risk: AgeRisk, motion: Allocation | None = None, cell: Allocation | None = None
+    ) -> RiskLevel:
         """Make a level.
 
         Args:
             risk: Risk by age whose oldest age with a back-off decides which targets are far from limits.
             motion: Allocation along motions; None: `near`.
+            cell: Allocation in moving cells; None: that of the configured link.
         """
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(risk.budgets < 1.0))
@@ -184,7 +190,8 @@ class RiskLevels:
         share = np.array(self._allowed / len(self._parts))
         distance = np.maximum(self.transit.reference_backoffs[-1, -1], near.reference_backoffs[-1, -1])
         far = np.maximum(distance, float(compute_quantile(share)) * oldest)
-        return RiskLevel(near, motion or near, far, transit_bounds=(self._b - far)[self._reference_rows])
+        bounds = (self._b - far)[self._reference_rows]
+        return RiskLevel(near, motion or near, cell or self.transit, far, transit_bounds=bounds)
 
     def get(self, level: int) -> RiskLevel:
         """Return a level; that of an observed link is made when it is asked for first."""
@@ -193,12 +200,13 @@ class RiskLevels:
             if self._free is None or not CERTIFICATE_LEVEL < level <= LAST_LEVEL:
                 raise QuestionError(f"the design has no level {level}")
             link = get_link(level)
-            motion = self._make_observed(RunLengthAges(*link, self._begins))
+            ages = RunLengthAges(*link, self._begins)
+            motion = self._make_observed(ages)
             if all(program.is_quick(link) for program in self._reference_programs.values()):
                 near = replace(self._free, reference_backoffs=self._find_distances(link))
             else:
                 near = replace(motion, weights=compute_stage_weights(link, self._problem.horizon))
-            found = self._levels[level] = self._make_level(near, near.risk, motion)
+            found = self._levels[level] = self._make_level(near, near.risk, motion, self._make_cell(ages))
         return found
 
     def make_all(self) -> None:
@@ -221,6 +229,15 @@ class RiskLevels:
             return self._levels[CERTIFICATE_LEVEL].near
         budgets = np.where(self._is_possible, risk.budgets, 1.0)
         return self._make_bounded(replace(risk, budgets=budgets), bounds_slack=False)
+
+    def _make_cell(self, link: AgeModel) -> Allocation:
+        """Make the allocation in moving cells on a link; the certificate's if the link leaves no risk."""
+        certificate = self._levels[CERTIFICATE_LEVEL].near
+        try:
+            risk = allocate_equally(link, self._problem.horizon, self._allowed, len(self._parts))
+        except DesignError:
+            return certificate
+        return self._make_allocation(risk, certificate.reference_backoffs)
 
     def _make_reference_programs(self) -> dict[int, ReferenceProgram]:
         """Make the program of each row that limits equilibria; alike rows share one."""

@@ -48,14 +48,16 @@ from uavctl.smpc.answer import (
 from uavctl.smpc.batch import Decisions, gather_answers
 from uavctl.smpc.conditioned.backoffs import (
     AGE_EXPONENT,
+    CELL_SHARE,
     MAX_RISK,
+    WIDENED_SHARE,
     AgeRisk,
     Flags,
     RowDeviations,
-    bound_widening,
     compute_violation_risk,
     find_binding,
     find_opposite_rows,
+    fit_deviations,
     reallocate_to_rows,
 )
 from uavctl.smpc.conditioned.levels import Allocation, RiskLevels
@@ -245,6 +247,8 @@ class ConditionedSolver:
         rest = self._find_rest(target, preview)
         reference, equilibrium_input = rest.reference, rest.equilibrium_input
         row_backoffs = self._find_row_backoffs(rest.allocation, preview)
+        if preview.resting_limits is not None:
+            row_backoffs = self._fit_to_cell(row_backoffs, rest.allocation.quantiles[preview.age], preview)
         first = (
             None if preview.sent is None or not self._slew.axes.size else self._slew.measure_first_step(preview.sent)
         )
@@ -411,6 +415,8 @@ class ConditionedSolver:
         level = self._levels.get(preview.level)
         if preview.path is not None:
             return level.motion
+        if preview.resting_limits is not None:
+            return level.cell
         kept = level.transit_bounds
         if limits is not self._b or preview.widening != 1.0:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
@@ -429,7 +435,9 @@ class ConditionedSolver:
             plain, age = self._deviations.compute(preview.cov), preview.age
             sigma = preview.widening * plain
             if preview.widening > 1.0:
-                sigma = bound_widening(sigma, plain, allocation.quantiles[age], self._b, self._opposite)
+                sigma = fit_deviations(
+                    sigma, allocation.quantiles[age], self._b, self._opposite, WIDENED_SHARE, least=plain
+                )
             if not allocation.follows_age:
                 sigma[len(sigma) - 1 - age :] *= preview.silence_widening
             # β_ti = Φ⁻¹(1 - ε̄_{a+t} / m) σ_ti for m rows
@@ -439,6 +447,14 @@ class ConditionedSolver:
                 _RowBackoffs(sigma, allocation.budgets[age], backoff, allocation.distant_quantiles[age]),
             )
         return self._cached_backoffs[1]
+
+    def _fit_to_cell(self, row_backoffs: _RowBackoffs, quantiles: Array, preview: Preview) -> _RowBackoffs:
+        """Fit back-offs to the room of a moving cell: an age whose back-offs need more has those that it leaves."""
+        limits = self._select_limits(preview)
+        sigma = fit_deviations(row_backoffs.sigma, quantiles, limits, self._opposite, CELL_SHARE)
+        if sigma is row_backoffs.sigma:
+            return row_backoffs
+        return _RowBackoffs(sigma, row_backoffs.budgets, quantiles * sigma, row_backoffs.distant_quantiles)
 
     def _find_reference(self, target: Array, limits: Array, preview: Preview) -> Array:
         """Return the equilibrium (n_x,) nearest to the target at rest; the rows that limit it share the budgets."""
