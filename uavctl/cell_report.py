@@ -20,7 +20,9 @@ from uavctl.flight.state import ControlState
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import CellReport, Conduct, ControlMode, Decision, Estimate, VehicleStatus
 
-COLUMN_M = 0.25  # half width of the column of a climb or landing: autopilots keep their place to 0.1 to 0.2 m
+# Half width of the column of a climb or landing, within the room that cells leave around each path (`margin_m`):
+# autopilots keep their place to 0.1 to 0.2 m
+COLUMN_M = 0.21
 GROUND_M = 0.1  # half height of a vehicle on the ground
 # Acceleration that a vehicle without plans may have for a while: gusts of 3 m/s, and the error of its model
 DRIFT_MPS2 = 0.5

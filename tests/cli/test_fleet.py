@@ -160,7 +160,7 @@ def test_vehicles_in_cells_share_one_room(tmp_path: Path, capsys: pytest.Capture
             ("vehicle[1]", "mission.trajectory", "waypoints"),
         ),
         (CELLS, ROOM, ("target.position_m=[0.9,-0.8,-2.0]",), ("vehicle[0]", "v0 and v1", "0.40 m apart")),
-        (CELLS, ROOM, ("target.position_m=[1.05,-0.8,-2.0]",), ("vehicle[0]", "0.55 m apart", "0.62 m")),
+        (CELLS, ROOM, ("target.position_m=[1.05,-0.8,-2.0]",), ("vehicle[0]", "0.55 m apart", "0.70 m")),
     ],
 )
 def test_vehicles_that_cannot_fly_in_cells_are_refused_with_key_and_remedy(
