@@ -136,6 +136,21 @@ def test_a_room_for_one_place_has_one() -> None:
     assert make_grid(np.full(3, -0.6), np.full(3, 0.6), 1.2).places_m.tolist() == [[0.0, 0.0]]
 
 
+def test_a_vehicle_at_its_goal_beside_a_place_leaves_for_one_that_waits_there() -> None:
+    # The goal of the second one is near to the place (1, 0) of the first one, and on its way to the place (0, 0)
+    grid = make_places((2, 2))
+    positions_m = np.array([[1.2, 0.0], [0.6, 0.4]])
+    goals_m = np.array([[0.0, 0.0], [0.9, 0.4]])
+    chosen_m = choose_places(positions_m, goals_m, np.array([9.0, 1.0]), np.ones(2, dtype=bool), grid)
+    assert chosen_m[0].tolist() == [0.0, 0.0]
+    for place_m in ([0.0, 0.0], [1.0, 0.0]):
+        assert np.abs(chosen_m[1] - place_m).max() >= PITCH_M
+    # One that is behind stays
+    behind_m = np.array([[0.7, 0.0], [1.1, 0.1]])
+    chosen_m = choose_places(behind_m, np.array([[0.0, 0.0], [1.1, 0.1]]), np.array([9.0, 1.0]), np.ones(2, bool), grid)
+    assert chosen_m.tolist() == [[0.0, 0.0], [1.1, 0.1]]
+
+
 def follow(
     distances_m: list[float], goal_m: Array, known: tuple[Progress, ...] = (), first: int = 0, is_movable: bool = True
 ) -> Progress:

@@ -3,8 +3,9 @@
 1. Places lie on a grid. Two vehicles at different ones are apart with their margins. The goal of a vehicle is one more
    place, of that vehicle alone.
 2. The vehicle that has come no nearer to its goal for longest chooses first: the next place on a shortest way.
-3. A vehicle that stands there inherits the priority. It chooses next, and leaves: ahead, else to the right, to the left
-   or back. If it cannot leave, the first one takes its next best place (backtracking).
+3. A vehicle that stands there, or ahead near the same place, inherits the priority. It chooses next, and leaves:
+   ahead, else to the right, to the left or back. If it cannot leave, the first one takes its next best place
+   (backtracking).
 4. No vehicle takes the place of one that waits for it. Vehicles in a ring could all move at once, but their cells
    cannot.
 
@@ -119,6 +120,7 @@ def choose_places(positions_m: Array, goals_m: Array, waits: Array, is_movable: 
     links[is_blocked] = links[:, is_blocked] = False
     search = _Search(
         places_m,
+        positions_m,
         at=_find_nearest_places(positions_m, places_m, is_blocked),
         hops=_count_hops(links, size),
         links=links,
@@ -165,6 +167,7 @@ class _Search:
 
     Args:
         places_m: North and east of the grid, then of the goals (V + N, 2).
+        positions_m: North and east of the vehicles (N, 2).
         at: Place where each vehicle is (N,).
         hops: Hops from each place to each goal (N, V + N).
         links: Whether a hop leads from one place to another.
@@ -173,10 +176,17 @@ class _Search:
     """
 
     def __init__(
-        self, places_m: Array, at: list[int], hops: Array, links: Flags, near: list[frozenset[int]], movable: list[int]
+        self,
+        places_m: Array,
+        positions_m: Array,
+        at: list[int],
+        hops: Array,
+        links: Flags,
+        near: list[frozenset[int]],
+        movable: list[int],
     ) -> None:
         self.next: dict[int, int] = {}  # place that each vehicle has chosen
-        self._places_m, self._at, self._hops, self._links = places_m, at, hops, links
+        self._places_m, self._positions_m, self._at, self._hops, self._links = places_m, positions_m, at, hops, links
         self._near, self._movable = near, movable
 
     def choose(self, i: int, asking: tuple[int, ...] = ()) -> bool:
@@ -189,14 +199,21 @@ class _Search:
             near = self._near[place]
             if any(taken in near for j, taken in self.next.items() if j != i):
                 continue
-            standing = [j for j in self._movable if j != i and self._at[j] in near]
-            if place != self._at[i] and any(j in asking for j in standing):
+            standing = [j for j in self._movable if j != i and (self._at[j] in near or self._is_ahead(j, i, place))]
+            if any(j in asking for j in standing):
                 continue
             self.next[i] = place
             if all(j in self.next or self.choose(j, (*asking, i)) for j in standing):
                 return True
         self.next[i] = self._at[i]
         return False
+
+    def _is_ahead(self, j: int, i: int, place: int) -> bool:
+        """Whether a vehicle is ahead of another one near to its place: a hop was not complete, or a goal is there."""
+        if place == self._at[i] or self._at[j] not in self._near[self._at[i]]:
+            return False
+        begin_m = self._positions_m[i]
+        return float((self._positions_m[j] - begin_m) @ (self._places_m[place] - begin_m)) > 0.0
 
     def _list_places(self, i: int) -> list[int]:
         """List the places that a vehicle can be at next, the best one first."""
