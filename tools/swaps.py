@@ -3,8 +3,8 @@
 It prints, for each number of vehicles, the figures of all seeds from the true positions: how many arrived, collisions,
 the closest pair, and the time to finish over that of a straight line. `--cycle` measures a cycle of the coordinator.
 
-    python tools/swaps.py --vehicles 2 4 8 12 --seeds 20 [--first 1000] [--autopilot ardupilot] [--method voronoi]
-        [--radio 5760]
+    python tools/swaps.py --vehicles 2 4 8 12 --seeds 20 [--first 1000] [--autopilot ardupilot] [--radio 5760]
+        [--method voronoi --cell-distance 0.8]
     python tools/swaps.py --vehicles 20 --cycle
 """
 
@@ -99,6 +99,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--autopilot", choices=("px4", "ardupilot"), default="px4")
     parser.add_argument("--plant", choices=("linear", "quadrotor"), default="quadrotor")
     parser.add_argument("--method", choices=("cells", "voronoi"), default="cells")
+    parser.add_argument("--cell-distance", type=float, metavar="M", help="distance of the cells; default: d = 0.5 m")
     parser.add_argument("--radio", type=float, metavar="BYTES_PER_S", help="one radio for the positions of all")
     parser.add_argument("--set", action="append", default=[], help="override of all vehicles")
     parser.add_argument("--out", type=Path, help="folder for the recordings, which are not kept without it")
@@ -115,7 +116,7 @@ def main(arguments: list[str]) -> int:
         for seed in range(options.first, options.first + options.seeds):
             case = SwapCase(
                 vehicles, seed, options.autopilot, options.plant, options.loss, options.method,
-                overrides=tuple(options.set), radio_bytes_per_s=options.radio,
+                overrides=tuple(options.set), radio_bytes_per_s=options.radio, cell_distance_m=options.cell_distance,
             )  # fmt: skip
             folder = None if options.out is None else options.out / f"swap-{vehicles}-{seed}"
             results.append(fly_swap(case, folder))

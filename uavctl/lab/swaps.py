@@ -65,6 +65,7 @@ class SwapCase:
     loss: float = 0.3  # of positions, cells and reports
     method: Method = "cells"
     distance_m: float = 0.5  # that pairs keep
+    cell_distance_m: float | None = None  # that their cells keep: a baseline may need more; None: the same
     limit_s: float = 120.0
     cells_end_s: float = math.inf  # when the coordinator stops
     overrides: tuple[str, ...] = ()  # of all vehicles
@@ -221,7 +222,7 @@ class Swap:
             for number, (seed, begin_m, goal_m) in enumerate(zip(seeds, begins_m, goals_m, strict=True))
         ]
         design = build_flight_design(configs[0])
-        self.parameters = build_cell_parameters(configs, case.distance_m)
+        self.parameters = build_cell_parameters(configs, case.cell_distance_m or case.distance_m)
         paths = [folder / f"vehicle-{number + 1}" / "flight.mcap" for number in range(case.vehicles)]
         prepared = [prepare(config, design) for config in configs]
         self._sender = (
