@@ -19,6 +19,7 @@ Intelligence 310, 2022), without rings, and with goals off the grid.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -142,13 +143,19 @@ def _find_reach_m(grid: Grid) -> float:
 def _count_hops(links: Flags, size: int) -> Array:
     """Count the hops from each place (V + N,) to each goal (N,), over the grid alone: (N, V + N)."""
     hops = np.full((len(links) - size, len(links)), np.inf)
-    between = shortest_path(links[:size, :size], unweighted=True)
+    between = _count_grid_hops(links[:size, :size].tobytes(), size)
     for number, row in enumerate(hops):
         ends = np.flatnonzero(links[size + number, :size])
         # h(p, g) = 1 + min over the neighbours e of g of h(p, e)
         row[:size] = 1.0 + between[:, ends].min(axis=1, initial=np.inf)
         row[size + number] = 0.0
     return hops
+
+
+@lru_cache(maxsize=8)  # the grid seldom changes, and this is a third of a choice
+def _count_grid_hops(links: bytes, size: int) -> Array:
+    """Count the hops between the places (V, V) of a grid with links (V, V)."""
+    return np.asarray(shortest_path(np.frombuffer(links, dtype=bool).reshape(size, size), unweighted=True))
 
 
 def _find_nearest_places(positions_m: Array, places_m: Array, is_blocked: Flags) -> list[int]:
