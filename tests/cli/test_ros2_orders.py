@@ -32,7 +32,7 @@ class PlayedNode:
     def advertise(self, kind: str, topic: str, *, is_latched: bool = False) -> Callable[[Mapping[str, Any]], None]:
         return lambda fields: self.published.append((topic, fields))
 
-    def subscribe(self, kind: str, topic: str, receive: Callable[[Any], None]) -> None:
+    def subscribe(self, kind: str, topic: str, receive: Callable[[Any], None], *, is_reliable: bool = False) -> None:
         self.receivers[topic] = receive
 
     def serve_trigger(self, kind: str, name: str, act: Callable[[], tuple[bool, str]]) -> None:

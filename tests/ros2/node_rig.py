@@ -20,11 +20,18 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @contextmanager
-def make_node() -> Iterator[Any]:
-    """A node of the tests' own process, in a domain of its own on this machine; child processes have it too."""
+def own_domain() -> Iterator[None]:
+    """A domain of the tests' own on this machine, for child processes too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+        yield
+
+
+@contextmanager
+def make_node() -> Iterator[Any]:
+    """A node of the tests' own process, in a domain of its own."""
+    with own_domain():
         rclpy.init(args=["--ros-args", "--disable-external-lib-logs"])
         yield rclpy.create_node("driver")
         rclpy.shutdown()

@@ -1,69 +1,67 @@
-"""`uavctl fly --mocap ros2://...` with a real node over localhost, which publishes what the simulated cameras see."""
+"""`uavctl fly` with positions and orders of a user's own program over ROS 2, judged by the true vehicle."""
 
 from __future__ import annotations
 
-import signal
-import socket
-import threading
+import json
+import math
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
-import pytest
-from geometry_msgs.msg import PoseStamped
-from node_rig import make_node
+from node_rig import own_domain
 from numpy.typing import NDArray
 from operation_rig import Scene, end_process, open_scene
 from patience import LIMIT_S, wait_until
-from rclpy.qos import qos_profile_sensor_data
-from sim_rig import decode
 
 from logs.recording.reader import read_kind
-from uavctl.records import PositionSample, StepInput
+from uavctl.config import load_config
+from uavctl.records import StepInput, Truth, Vec3
 
-pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")  # of a parser that rclpy imports
-SAMPLES, NEAR_M = 20, 0.1
+NODE = Path(__file__).parent / "user_node.py"
+GOAL_M: Vec3 = (0.5, -1.0, -1.4)  # local NED
+GOTO = "goto -1.0 0.5 1.4"  # there, in frame `map`
+NEAR_M, REST_MPS, REST_S, SAMPLE_M = 0.3, 0.3, 2.0, 0.1
+EXACT = ("sim.camera.rate_hz=60.0", "link.loss=0.0", "link.delay_s=0.0", "link.jitter_s=0.0")
+# A machine that stands still sends setpoints late, and the vehicle then moves as none says, and far.
+PATIENT = (
+    "envelope.unexplained_mps2=50",
+    "envelope.disagreement_mps=20",
+    "limits.accel_mps2=[1,1,1]",
+    "sets.input_lower=[-1,-1,-1]",
+    "sets.input_upper=[1,1,1]",
+    "sets.state_lower=[-20,-1.5,-inf,-20,-1.5,-inf,-10,-1,-inf]",
+    "sets.state_upper=[20,1.5,inf,20,1.5,inf,0,1,inf]",
+)
 
 
-@pytest.fixture(scope="module")
-def node() -> Iterator[Any]:
-    with make_node() as made:
-        yield made
+class User:
+    """A user's program that runs."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def give(self, order: str) -> None:
+        """Give an order, which is accepted."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(f"{order}\n")
+        self._process.stdin.flush()
+        answer = json.loads(self._process.stdout.readline())
+        assert answer["ok"], f"{order}: {answer}"
 
 
 @contextmanager
-def seen_by_a_driver(air: Scene, node: Any) -> Iterator[None]:
-    """A driver that publishes what the simulated cameras see; the daemon's positions are its topic."""
-    publisher, is_over = node.create_publisher(PoseStamped, "/drone/pose", qos_profile_sensor_data), threading.Event()
-    where = urlsplit(air.mocap)
-    with socket.socket(type=socket.SOCK_DGRAM) as cameras:
-        cameras.bind((where.hostname, where.port))
-        cameras.settimeout(0.05)
-
-        def publish() -> None:
-            while not is_over.is_set():
-                try:
-                    (seen,) = decode(cameras.recv(2048))
-                except TimeoutError:
-                    continue
-                message = PoseStamped()
-                message.header.frame_id = "map"
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(seen.usec * 1000, 10**9)
-                position = message.pose.position
-                position.x, position.y, position.z = float(seen.y), float(seen.x), float(-seen.z)
-                publisher.publish(message)
-
-        thread = threading.Thread(target=publish)
-        thread.start()
-        air.mocap = "ros2://drone/pose?frame=map"
-        try:
-            yield
-        finally:
-            is_over.set()
-            thread.join()
-            node.destroy_publisher(publisher)
+def seen_by_a_user(air: Scene) -> Iterator[User]:
+    """A user's program that publishes what the simulated cameras see; the daemon's positions are its topic."""
+    command = [sys.executable, str(NODE), str(urlsplit(air.mocap).port), "/drone/pose", "drone1"]
+    air.mocap = "ros2://drone/pose?frame=map"
+    with end_process(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)) as process:
+        assert process.stdin is not None
+        with process.stdin:
+            yield User(process)
 
 
 def off_m(place: NDArray[np.float64], way: NDArray[np.float64]) -> float:
@@ -74,18 +72,45 @@ def off_m(place: NDArray[np.float64], way: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(begin + part[:, None] * step - place, axis=1).min())
 
 
-def test_a_daemon_s_positions_are_where_the_true_vehicle_went(node: Any) -> None:
-    overrides = ("sim.camera.rate_hz=60.0", "link.loss=0.0", "link.delay_s=0.0", "link.jitter_s=0.0")
-    with open_scene(*overrides) as air, seen_by_a_driver(air, node), end_process(air.fly("f")) as process:
-        recording = air.folder / "f" / "flight.mcap"
+def rests(truths: list[Truth], place_m: Vec3 | None = None) -> bool:
+    """Whether the true vehicle has been slow, and near its newest place or a given one, in the last seconds."""
+    if not truths or truths[-1].at_ns - truths[0].at_ns < REST_S * 1e9:
+        return False
+    newest = truths[-1]
+    recent = [truth for truth in truths if truth.at_ns >= newest.at_ns - REST_S * 1e9]
+    return all(
+        math.dist(truth.position_m, place_m or newest.position_m) < NEAR_M
+        and math.hypot(*truth.velocity_mps) < REST_MPS
+        for truth in recent
+    )
 
-        def list_samples() -> list[PositionSample]:
-            return [sample for step in read_kind(recording, StepInput) for sample in step.samples]
 
-        wait_until(recording.exists, "it records")
-        wait_until(lambda: len(list_samples()) > SAMPLES, "positions come")
-        process.send_signal(signal.SIGINT)
+def test_a_user_s_program_flies_the_true_vehicle_by_poses_and_orders() -> None:
+    target_m = load_config("room").target.position_m
+    options = ["--ros2", "drone1", "--ros2-orders", *(text for one in PATIENT for text in ("--set", one))]
+    with (
+        own_domain(),
+        open_scene(*EXACT) as air,
+        seen_by_a_user(air) as user,
+        end_process(air.fly("f", *options, stderr=subprocess.DEVNULL)) as process,
+    ):
+        user.give("hold")
+        held = len(air.truths)
+        wait_until(lambda: rests(air.truths[held:]), "it holds")
+        assert math.dist(air.truths[-1].position_m, target_m) > 1.0  # the order keeps it from there
+
+        user.give(GOTO)
+        wait_until(lambda: rests(air.truths, GOAL_M), "it is at the goal")
+        user.give("resume")
+        wait_until(lambda: rests(air.truths, target_m), "it is at the mission's target")
+
+        user.give("land")
+        wait_until(lambda: air.truths[-1].position_m[2] == 0.0, "it is on the floor")
+        assert math.dist(air.truths[-1].position_m[:2], target_m[:2]) < 2 * NEAR_M
         process.communicate(timeout=LIMIT_S)
-        samples, way = list_samples(), np.array([truth.position_m for truth in air.truths])
+        recording = air.folder / "f" / "flight.mcap"
+        samples = [sample for step in read_kind(recording, StepInput) for sample in step.samples]
+        way = np.array([truth.position_m for truth in air.truths])
+    assert process.returncode == 0
     assert {sample.source for sample in samples} == {"ODOMETRY 246/197"}
-    assert max(off_m(np.array(sample.position_m), way) for sample in samples) < NEAR_M
+    assert max(off_m(np.array(sample.position_m), way) for sample in samples) < SAMPLE_M

@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from node_rig import LATCHED, call, make_node, spinning, subscribe
 from patience import wait_until
+from rclpy.qos import ReliabilityPolicy
 from view_rig import fly_view
 from visualization_msgs.msg import MarkerArray
 
@@ -120,7 +121,9 @@ def test_orders_of_nodes_reach_the_daemon(node: Any, tmp_path: Path) -> None:
             answer = call(node, f"/drone1/{name}")
             assert (answer.success, answer.message) == (True, "as ordered")
         assert [request["ask"] for request in requests] == ["hold", "resume", "land"]
-        wait_until(lambda: node.count_subscribers("/drone1/goto") > 0, "it takes positions")
+        wait_until(lambda: goals.get_subscription_count() > 0, "it takes positions")
+        (subscription,) = node.get_subscriptions_info_by_topic("/drone1/goto")
+        assert subscription.qos_profile.reliability is ReliabilityPolicy.RELIABLE  # no order is lost on a poor network
         goals.publish(goal)
         wait_until(lambda: len(requests) > 3, "the position has come")
     assert requests[3] == {"ask": "goto", "position_m": [2.0, 1.0, -3.0]}

@@ -118,7 +118,7 @@ def serve_orders(node: Ros2Node, namespace: str, orders: Orders) -> None:
     for name in SERVICES:
         request = ControlRequest(ask=name)
         node.serve_trigger(TRIGGER, resolve_name(namespace, name), partial(orders.give, request))
-    node.subscribe(GOTO_KIND, resolve_name(namespace, "goto"), orders.go_to)
+    node.subscribe(GOTO_KIND, resolve_name(namespace, "goto"), orders.go_to, is_reliable=True)
 
 
 def main(arguments: list[str]) -> int:

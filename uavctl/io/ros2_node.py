@@ -15,6 +15,7 @@ from uavctl.errors import in_words
 from uavctl.io.camera import CameraError
 
 EXTRA = "ros2"
+_RELIABLE_DEPTH = 10  # messages that wait; a number alone is a reliable subscription
 # Logs go nowhere: nobody reads the console of a process, and a file of each start would stay behind.
 _INIT_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs", "--disable-rosout-logs", "--disable-stdout-logs"]
 
@@ -29,13 +30,15 @@ class Ros2Node:
         """Handle one message or request that has come, or wait for it."""
         self._executor.spin_once(timeout_sec=timeout_s)
 
-    def subscribe(self, kind: str, topic: str, receive: Callable[[Any], None]) -> None:
-        """Subscribe best-effort with a short queue, as for sensor data.
+    def subscribe(self, kind: str, topic: str, receive: Callable[[Any], None], *, is_reliable: bool = False) -> None:
+        """Subscribe, by default best-effort with a short queue, as for sensor data.
 
         Args:
             kind: Type of the messages, as `geometry_msgs/msg/PoseStamped`.
+            is_reliable: Whether a lost message is sent again, and one waits that is sent before the writer is known.
         """
-        self._node.create_subscription(import_type(kind), topic, receive, self._sensor_qos)
+        qos = _RELIABLE_DEPTH if is_reliable else self._sensor_qos
+        self._node.create_subscription(import_type(kind), topic, receive, qos)
 
     def advertise(self, kind: str, topic: str, *, is_latched: bool = False) -> Callable[[Mapping[str, Any]], None]:
         """Offer a topic; return the function that publishes a message by its fields.
