@@ -322,7 +322,7 @@ _EVENTS = {
     HandoverEvent.REFUSED: "the vehicle refused for good, or did not react within `[hand_over]`; the event has its "
     "reason (COMMAND_ACK, STATUSTEXT); exit code 1",
     HandoverEvent.SILENCE: "no heartbeat, or the last one is too old",
-    HandoverEvent.TAKE_OFF: "`--arm --takeoff HEIGHT`; nothing else leads to arming",
+    HandoverEvent.TAKE_OFF: "`--arm --takeoff HEIGHT` or `ctl takeoff --arm`; nothing else leads to arming",
     HandoverEvent.ENGAGE: "`uavctl ctl engage`; nothing else leads back from the pilot",
     HandoverEvent.LEFT: "armed when first heard, and the daemon before ended unasked in flight "
     "([operation](operation.md#after-the-pilots-switch))",

@@ -31,7 +31,7 @@ from uavctl.flight.tick import tick as run_tick
 from uavctl.inbox import Inbox
 from uavctl.mavlink.connection import OVERRUN, VEHICLE, make_links
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
-from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
+from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal, explain_take_off_refusal
 from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
 from uavctl.mavlink.landing import LandingRequest, LandingTarget
 from uavctl.mavlink.messages import CommandAck, StatusText
@@ -129,6 +129,7 @@ class ControlLoop:
         self._landing_request = LandingRequest((config.daemon.system_id, config.daemon.component_id), config.hand_over)
         self._last_setpoint_ns: int | None = None  # the last setpoint that flew the vehicle
         self._lands_on_failure = config.fallback.land or config.relay.enabled
+        self.on_datagram: Callable[[str, bytes, int], None] = lambda *_: None  # link, data, time of arrival [ns]
         self.account = FlightAccount()
 
     @property
@@ -196,6 +197,7 @@ class ControlLoop:
         """Receive one datagram that arrived at `at_ns`; ticks before that time use none of its positions."""
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
         try:
+            self.on_datagram(link, data, at_ns)
             return self._handle_data(link, data, at_ns)
         except Exception as error:  # noqa: BLE001 one datagram ends no flight; a link that is not heard does in order
             event = self._make_error_event(f"link {link}: a datagram: {_describe_error(error)}", at_ns)
@@ -514,7 +516,10 @@ class ControlLoop:
         self._external_solve_ns = took_ns
 
     def explain_refusal(self, order: Order) -> str:
-        """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
+        """Return why an order to move or take off would have no effect now; empty if it may be taken."""
+        if order is Order.TAKE_OFF:
+            is_ordered = self._hand_over.is_ordered_flight
+            return explain_take_off_refusal(self.handover_state, self._vehicle, is_ordered_flight=is_ordered)
         is_move = order in (Order.GOTO, Order.HOLD, Order.RESUME)
         return explain_move_refusal(self.handover_state, self._vehicle) if is_move else ""
 

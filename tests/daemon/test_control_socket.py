@@ -95,12 +95,37 @@ class Flight:
         return Event(at_ns=at_ns, severity=severity, code=code, text=f"{command.order} {'yes' if good else 'no'}")
 
 
+class Check:
+    """A check before a take-off that ends as it is told."""
+
+    def __init__(self) -> None:
+        self.result: str | None = None  # None: it runs on
+        self.heights_m: list[float] = []
+        self.fault: Exception | None = None
+        self.is_cancelled = False
+
+    def begin(self, height_m: float, at_ns: int) -> str:
+        if height_m > 2.0:
+            return "too high"
+        self.heights_m.append(height_m)
+        return ""
+
+    def update(self, at_ns: int) -> str | None:
+        if self.fault is not None:
+            raise self.fault
+        return self.result
+
+    def cancel(self) -> None:
+        self.is_cancelled = True
+
+
 class Rig:
     def __init__(self, folder: Path, listener: socket.socket, room: int = 16) -> None:
         self.path = folder / "one.sock"
         self.flight = Flight(room)
         self.permits = 0
-        self.server = ControlServer(listener, CONFIG, self.flight, health, self.permit)
+        self.check = Check()
+        self.server = ControlServer(listener, CONFIG, self.flight, health, self.permit, self.check)
         self.now_ns = 0
         self._clients: list[socket.socket] = []
 
@@ -183,6 +208,54 @@ def test_an_order_that_would_come_to_nothing_is_refused_with_the_reason_and_reac
     assert heard(held)["ok"] and rig.flight.taken == [Command(order=Order.HOLD)]
 
 
+TAKE_OFF = Command(order=Order.TAKE_OFF, height_m=1.2)
+
+
+def test_a_take_off_is_ordered_after_its_check_and_others_are_served_meanwhile(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="take-off", height_m=1.2, arm=True))
+    rig.ticks(400)  # 20 s: the waiting client is not idle
+    (other,) = rig.say(ask(ask="hold"))
+    rig.ticks(2)
+    assert heard(client) is None and heard(other)["ok"] and rig.flight.taken == [Command(order=Order.HOLD)]
+    rig.check.result = ""
+    rig.ticks(2)
+    assert heard(client) == {"ok": True, "text": "take-off yes", "status": None}
+    assert rig.check.heights_m == [1.2] and rig.flight.taken[1:] == [TAKE_OFF]
+
+
+def test_a_take_off_whose_check_fails_is_refused_with_the_reason(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="take-off", height_m=1.2, arm=True))
+    rig.check.result = "the battery is empty"
+    rig.ticks(3)
+    assert heard(client) == {"ok": False, "text": "the battery is empty", "status": None} and not rig.flight.taken
+
+
+def test_a_take_off_whose_client_has_gone_is_not_ordered(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="take-off", height_m=1.2, arm=True))
+    rig.ticks()
+    client.close()
+    rig.check.result = ""
+    rig.ticks(3)
+    assert rig.check.is_cancelled and not rig.flight.taken
+
+
+def test_an_error_in_the_check_arms_nothing_and_leaves_the_other_orders(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="take-off", height_m=1.2, arm=True))
+    rig.check.fault = ValueError("no such parameter")
+    rig.ticks(2)
+    (other,) = rig.say(ask(ask="land"))
+    rig.ticks(2)
+    assert "no such parameter" in heard(client)["text"] and rig.check.is_cancelled
+    assert heard(other)["ok"] and rig.flight.taken == [Command(order=Order.LAND)]
+
+
+def test_the_end_of_the_flight_answers_a_take_off_that_is_being_checked(rig: Rig) -> None:
+    (client,) = rig.say(ask(ask="take-off", height_m=1.2, arm=True))
+    rig.ticks()
+    rig.server.close()
+    assert not heard(client)["ok"] and not rig.flight.orders
+
+
 def test_status_is_answered_at_once(rig: Rig) -> None:
     (client,) = rig.say(ask(ask="status"))
     rig.ticks()
@@ -202,6 +275,13 @@ def test_status_is_answered_at_once(rig: Rig) -> None:
         (ask(ask="goto", position_m=[0, 0]), "not understood"),
         (b'{"ask": "goto", "position_m": [NaN, 0, -1]}\n', "not understood"),
         (b'{"ask": "goto", "position_m": [1e999, 0, -1]}\n', "not understood"),
+        (ask(ask="take-off", height_m=1.2), "needs arm"),
+        (ask(ask="take-off", arm=True), "height_m"),
+        (ask(ask="take-off", arm=True, height_m=-1.2), "height_m"),
+        (ask(ask="take-off", arm=True, height_m=0), "height_m"),
+        (b'{"ask": "take-off", "arm": true, "height_m": 1e999}\n', "not understood"),
+        (ask(ask="take-off", arm=True, height_m=3.0), "too high"),
+        (ask(ask="hold", arm=True), "takes no height_m and no arm"),
         (ask(ask="goto", position_m=[0, 0, 1.1]), "up is negative: write -1.1"),
         (ask(ask="goto", position_m=[3.5, 0, 0.5]), "north 3.5 m is outside the admissible box [-3, 3]; down 0.5 m"),
     ],

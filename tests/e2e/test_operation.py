@@ -77,6 +77,32 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
 
 
 @pytest.mark.slow
+def test_ctl_takeoff_arms_a_vehicle_on_the_ground_only_with_arm_and_only_once() -> None:
+    accepted = ("--set", 'check.accept=["COM_OF_LOSS_T"]')  # of the patient vehicle
+    with open_scene(airborne=False) as ground, end_process(ground.fly("f", *accepted)) as process:
+        wait_until(
+            lambda: ground.ctl("status")[0] == 0 and ground.status()["who_flies"] == "ready", "the daemon stands by"
+        )
+        for wrong in (("1.2",), ("-1.2", "--arm"), ("0", "--arm"), ("nan", "--arm"), ("--arm",)):
+            assert ground.ctl("takeoff", *wrong)[0] == 2
+        code, _, errors = ground.ctl("takeoff", "50", "--arm")
+        assert code == 1 and "sets.state_lower" in errors
+        assert not ground.status()["vehicle"]["armed"]
+        floor_m = -ground.truths[-1].position_m[2]
+        code, _, errors = ground.ctl("takeoff", "1.2", "--arm")
+        assert code == 0, errors
+        wait_until(lambda: ground.status()["mode"] == "track", "the daemon flies")
+        assert -ground.truths[-1].position_m[2] - floor_m > 0.3 * 1.2
+        assert ground.ctl("takeoff", "1.2", "--arm")[0] == 1
+        wait_until(lambda: abs(ground.truths[-1].position_m[2] - ground.status()["target_m"]["down"]) < 0.3, "the goal")
+        process.send_signal(signal.SIGINT)
+        summary, errors = process.communicate(timeout=LIMIT_S)
+        assert process.returncode == 0, errors
+        assert json.loads(summary)["ending"]["as_ordered"]
+        assert abs(-ground.truths[-1].position_m[2] - floor_m) < 0.1  # the end waits until it stands
+
+
+@pytest.mark.slow
 @pytest.mark.fault(31)
 def test_after_sigkill_without_a_landing_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
     with end_process(air.fly("f", "--set", "fallback.land=false")) as process:

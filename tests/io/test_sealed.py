@@ -333,7 +333,7 @@ def test_a_flood_that_holds_nothing_is_taken_by_the_handful() -> None:
         Ticker(50_000_000, 200_000_000, lambda: now_ns[0]),
         lambda: False,
         duration_s=1.0,
-        stop_limit_s=0.0,
+        stop_limit_s=lambda: 0.0,
         wait_for=wait,
         now=lambda: now_ns[0],
     )

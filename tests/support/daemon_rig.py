@@ -59,7 +59,7 @@ class DaemonRig:
             Ticker(TICK_NS, DT_NS, lambda: self.now_ns),
             lambda: self.now_ns >= stop_at_s * SECOND,
             duration_s=duration_s,
-            stop_limit_s=stop_limit_s,
+            stop_limit_s=lambda: stop_limit_s,
             give_orders=self.give_orders,
             after_tick=self.services,
             on_events=self.tell,

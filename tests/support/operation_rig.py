@@ -156,8 +156,8 @@ class Scene:
 
 
 @contextmanager
-def open_scene(*overrides: str) -> Iterator[Scene]:
-    """A simulated vehicle in the air, as long as the block lasts."""
+def open_scene(*overrides: str, airborne: bool = True) -> Iterator[Scene]:
+    """A simulated vehicle in the air, or on the ground, as long as the block lasts."""
     with reserve_port() as first, reserve_port() as second, tempfile.TemporaryDirectory(prefix="uavctl-") as folder:
         vehicle_port, mocap_port = int(first.getsockname()[1]), int(second.getsockname()[1])
         first.close()
@@ -173,7 +173,7 @@ def open_scene(*overrides: str) -> Iterator[Scene]:
                 f"udpout://127.0.0.1:{tap.vehicle_port}",
                 f"udpout://127.0.0.1:{mocap_port}",
                 duration_s=None,
-                airborne=True,
+                airborne=airborne,
                 on_ready=lambda _: None,
                 on_truth=result.truths.append,
                 stop=done.is_set,

@@ -40,6 +40,7 @@ class Preflight:
     Args:
         make_links: makes the links (`uavctl.mavlink.connection.make_links`).
         take_off_m: height of the climb that is planned [m].
+        is_beside_flight: a control loop uses the same connections: it relays the positions.
     """
 
     def __init__(
@@ -50,8 +51,9 @@ class Preflight:
         *,
         move: bool = False,
         take_off_m: float | None = None,
+        is_beside_flight: bool = False,
     ) -> None:
-        self._config, self._take_off_m = config, take_off_m
+        self._config, self._take_off_m, self._is_beside_flight = config, take_off_m, is_beside_flight
         self._links = make_links(config, self._handle_message)
         self._data = CheckData(start_ns)
         self._relay = Relay(config.relay)
@@ -84,7 +86,8 @@ class Preflight:
                 send(Outgoing(link=name, data=data))
         vehicle = self._links[VEHICLE]
         for data in vehicle.encode_relayed_poses(self._relay, at_ns, refused=()):
-            send(Outgoing(link=VEHICLE, data=data))
+            if not self._is_beside_flight:
+                send(Outgoing(link=VEHICLE, data=data))
         if vehicle.vehicle is not None:
             for data in vehicle.setup_global_origin(at_ns, self._config.hand_over.origin_deg_m):
                 send(Outgoing(link=VEHICLE, data=data))
@@ -104,6 +107,10 @@ class Preflight:
         for name in list_parameters(kind):
             if name not in self._data.parameters:
                 yield vehicle.encode_parameter_request(name)
+
+    def is_complete(self, elapsed_s: float, limit_s: float) -> bool:
+        """Return whether the check has listened long enough: longer where the vehicle's own position is missing."""
+        return elapsed_s >= limit_s and (elapsed_s >= limit_s + self._config.check.wait_s or not self._needs_position)
 
     def make_items(self, at_ns: int) -> tuple[Item, ...]:
         """Return the items of the check as known by `at_ns`."""
@@ -144,7 +151,7 @@ class Preflight:
         ]
 
     @property
-    def needs_vehicle_position(self) -> bool:
+    def _needs_position(self) -> bool:
         """Whether a vehicle answers, but its own position, which would show more, is missing."""
         uses_vehicle_position = self._config.source.messages == ("LOCAL_POSITION_NED",)
         has_both = self._data.heartbeat is not None and bool(self._data.samples)

@@ -64,7 +64,10 @@ _COMMANDS = {
     "bench": ("bench:bench", "Measure the speed of a decision, or the link to another computer."),
     "paper": ("paper:paper", "Reproduce Section 5 of the paper, every claim beside its measured figure."),
     "campaign": ("campaign:campaign", "Fly many runs of many controllers on the same noise and the same losses."),
-    "ctl": ("ctl:ctl_app", "Send an order to a running flight: goto, hold, resume, land, engage; or show its status."),
+    "ctl": (
+        "ctl:ctl_app",
+        "Send an order to a running flight: takeoff, goto, hold, resume, land, engage; or show its status.",
+    ),
     "key": ("key:key_app", "Make and look at keys of MAVLink 2 signing."),
     "log": ("log:log_app", "Read recordings: info, recover, replay, report, compare, whatif, export."),
     "docs": ("app:docs", "Show a page of the manual, or list its pages."),

@@ -86,14 +86,7 @@ def run_preflight(
         closed = all(connection.closed for connection in connections.values())
         elapsed_s = (due.at_ns - begin_ns) * 1e-9
         limit_s = seconds + (MOVE_LIMIT_S if moving else 0.0)
-        if (
-            closed
-            or stop()
-            or (
-                elapsed_s >= limit_s
-                and (elapsed_s >= limit_s + config.check.wait_s or not flight.needs_vehicle_position)
-            )
-        ):
+        if closed or stop() or flight.is_complete(elapsed_s, limit_s):
             return flight.make_items(due.at_ns)
         due = ticker.next()
 
@@ -139,10 +132,15 @@ def check_before_arming(
     refusals = find_refusals(items, config.check)
     if refusals:
         raise NotReadyError("\n".join(("not armed, because the check failed:", *map(describe_item, refusals))))
+    print_items(items)
+    return items
+
+
+def print_items(items: Iterable[Item]) -> None:
+    """Print the items that are not good."""
     for item in items:
         if item.state is not ItemState.GOOD:
             print_message(label_text("check", describe_item(item)))
-    return items
 
 
 def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:

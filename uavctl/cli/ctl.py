@@ -22,12 +22,13 @@ from uavctl.mavlink.relay import REASONS
 from uavctl.records import Vec3
 
 ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
+CHECK_LIMIT_S = 1300.0  # `check.seconds` and `check.wait_s` take 600 s each at most
 _BLOCK_BYTES = 65_536
 _MAX_ANSWER_BYTES = 2**20  # a daemon's status has some thousand
 
 ctl_app = App(
     name="ctl",
-    help="Orders to a running flight: goto, hold, resume, land, engage; and its status.",
+    help="Orders to a running flight: takeoff, goto, hold, resume, land, engage; and its status.",
     help_epilogue=format_example("ctl"),
     help_format="markdown",
 )
@@ -58,6 +59,30 @@ def goto(*place: Annotated[str, Parameter(allow_leading_hyphen=True)], choice: D
         place: north,east,down, or each for itself.
     """
     return _send_order(ControlRequest(ask="goto", position_m=_parse_position(",".join(place))), choice)
+
+
+@ctl_app.command(usage="Usage: uavctl ctl takeoff [OPTIONS] HEIGHT", help_epilogue=format_example("ctl takeoff"))
+def takeoff(
+    height: Annotated[float, Parameter(allow_leading_hyphen=True)],
+    /,
+    *,
+    arm: Annotated[bool, Parameter(negative=(), help="the vehicle may be armed; needed")] = False,
+    choice: DaemonChoice = ANY_DAEMON,
+) -> int:
+    """Check vehicle and cameras, arm, climb HEIGHT [m] above the ground, and fly, as `uavctl fly --arm --takeoff`.
+
+    The vehicle stands disarmed on the ground. Ctrl-C during the check takes the order back.
+
+    Args:
+        height: height of the climb [m].
+    """
+    if not arm:
+        raise UsageError("takeoff needs --arm: it permits arming the vehicle")
+    request = ControlRequest(ask="take-off", height_m=height, arm=arm)
+    if request.find_problem() is not None:
+        raise UsageError(f"takeoff {height:g}: give a height above the ground [m], as in 1.2")
+    print_message("checking before arming; Ctrl-C takes the order back")
+    return _send_order(request, choice, CHECK_LIMIT_S)
 
 
 OrderName = Literal["hold", "resume", "land", "engage"]
@@ -105,8 +130,8 @@ def _parse_position(text: str) -> Vec3:
     return north, east, down
 
 
-def _send_order(request: ControlRequest, choice: DaemonChoice) -> int:
-    reply = send_request(request, find_control_folder(choice.control), choice.vehicle)
+def _send_order(request: ControlRequest, choice: DaemonChoice, limit_s: float | None = None) -> int:
+    reply = send_request(request, find_control_folder(choice.control), choice.vehicle, limit_s)
     if choice.json:
         Common(json=True).show("ctl/order", {"ok": reply.ok, "text": reply.text}, str)
     else:
@@ -115,14 +140,18 @@ def _send_order(request: ControlRequest, choice: DaemonChoice) -> int:
     return 0 if reply.ok else 1
 
 
-def send_request(request: ControlRequest, folder: Path, vehicle: str | None) -> Reply:
+def send_request(request: ControlRequest, folder: Path, vehicle: str | None, limit_s: float | None = None) -> Reply:
     """Return the daemon's answer to a request.
+
+    Args:
+        limit_s: Longest wait for it [s]; None: `ANSWER_LIMIT_S`.
 
     Raises:
         NotReachedError: No daemon, several daemons, or no answer.
     """
     with _connect_daemon(folder, vehicle) as connection:
         try:
+            connection.settimeout(ANSWER_LIMIT_S if limit_s is None else limit_s)
             connection.sendall(msgspec.json.encode(request) + b"\n")
             line = bytearray()
             while not line.endswith(b"\n"):
@@ -135,8 +164,8 @@ def send_request(request: ControlRequest, folder: Path, vehicle: str | None) -> 
             return msgspec.json.decode(line, type=Reply)
         except OSError as error:
             raise NotReachedError(
-                f"no answer within {ANSWER_LIMIT_S:g} s ({error}); the daemon is not ready yet (its design, the check "
-                "before arming), or the control loop may hang: watch the vehicle"
+                f"no answer within {connection.gettimeout():g} s ({error}); the daemon is not ready yet "
+                "(its design, the check before arming), or the control loop may hang: watch the vehicle"
             ) from error
         except msgspec.MsgspecError as error:
             raise NotReachedError(

@@ -43,6 +43,7 @@ from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.flight_orders import FlightOrders, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.landing_guard import guard_landing
 from uavctl.daemon.lock import lock_vehicle
+from uavctl.daemon.take_off_check import TakeOffCheck
 from uavctl.daemon.tick_limit import ENGAGED_LIMIT_S, LIMIT_S, limit_ticks
 from uavctl.errors import UsageError
 from uavctl.io.signed_connection import open_links
@@ -163,9 +164,15 @@ def fly_daemon(
             prepared = prepare(config, design)
         prepared.make_levels()
         # Loaded late: it takes an eighth of the loading time of `fly`.
-        from uavctl.cli.check import check_before_arming, make_mission_items, record_items, record_parameters
+        from uavctl.cli.check import (
+            check_before_arming,
+            make_mission_items,
+            print_items,
+            record_items,
+            record_parameters,
+        )
 
-        mission_items = () if take_off_m is None else make_mission_items(config, prepared)
+        mission_items = make_mission_items(config, prepared)  # also for a take-off that is ordered later
         begin_s = time.perf_counter()
         with (
             enable_realtime_process(realtime) as garbage_functions,
@@ -180,6 +187,13 @@ def fly_daemon(
             recorder = Recorder(path, config.log, derived_topics=viewers)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             orders.begin(loop)
+
+            def report_items(items: tuple[Item, ...]) -> None:
+                print_items(items)
+                record_items(recorder, items, monotonic_ns())
+
+            region = prepared.controller.mission.rest_region
+            checker = TakeOffCheck(config, loop, connections, region, mission_items, report_items)
             is_stop_requested = False
             try:
                 put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
@@ -196,7 +210,7 @@ def fly_daemon(
                 with (
                     show_live_line(loop, recorder.status, duration_s, config.daemon.tick_s) as feed,
                     run_services(
-                        loop, config, path, recorder.status, listener, orders.permit_take_off
+                        loop, config, path, recorder.status, listener, orders.permit_take_off, checker
                     ) as service_functions,
                     record_failure(loop),
                     limit_ticks(ENGAGED_LIMIT_S if config.smpc.controller else LIMIT_S) as tick_limit,
@@ -208,7 +222,7 @@ def fly_daemon(
                         Ticker(tick_ns, dt_ns),
                         stopped,
                         duration_s=duration_s,
-                        stop_limit_s=compute_stop_limit_s(config, takes_off=orders.takes_off),
+                        stop_limit_s=lambda: compute_stop_limit_s(config, takes_off=loop.account.takes_off),
                         give_orders=lambda ticked, _: orders.handle_tick(loop, ticked),
                         after_tick=(
                             *guard_functions,

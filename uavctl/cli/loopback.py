@@ -207,7 +207,7 @@ def _fly_real_time(prepared: Prepared, path: Path, orders: FlightOrders, viewers
                     Ticker(tick_ns, dt_ns),
                     stopped,
                     duration_s=config.duration_s,
-                    stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
+                    stop_limit_s=lambda: compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
                     give_orders=lambda ticked, _: orders.handle_tick(loop, ticked),
                     after_tick=(feed.after_tick, lambda *_: recorder.catch_up(), collector.after_tick),
                     on_events=feed.events.extend,

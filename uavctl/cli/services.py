@@ -14,7 +14,7 @@ from logs.recording.recorder import RecorderStatus
 from uavctl.cli.health_lines import choose_line_writer
 from uavctl.cli.output import label_text, print_message
 from uavctl.config import Config
-from uavctl.daemon.control_socket import ControlServer, make_daemon_name
+from uavctl.daemon.control_socket import ControlServer, TakeOffChecker, make_daemon_name
 from uavctl.daemon.daemon import AfterTick
 from uavctl.daemon.health import HealthMonitor, RecorderHealth
 from uavctl.daemon.notifier import Notifier
@@ -30,6 +30,7 @@ def run_services(
     status: Callable[[], RecorderStatus],
     listener: socket.socket,
     permit_take_off: Callable[[], None],
+    take_off_checker: TakeOffChecker,
 ) -> Iterator[Sequence[AfterTick]]:
     """Yield the functions that the daemon calls after each tick; close the services at the end.
 
@@ -47,7 +48,7 @@ def run_services(
 
     identity = (make_daemon_name(config), config.daemon.vehicle, os.getpid())
     monitor = HealthMonitor(loop, config, identity, get_recorder_health, report_health)
-    server = ControlServer(listener, config, loop, monitor.make_health, permit_take_off)
+    server = ControlServer(listener, config, loop, monitor.make_health, permit_take_off, take_off_checker)
     try:
         # The sign of life comes last: it confirms all work of the tick.
         yield monitor.after_tick, server.after_tick, notifier.after_tick

@@ -41,6 +41,7 @@ EXAMPLES = {
     "paper": "uavctl paper --runs 200",
     "campaign": "uavctl campaign docs/campaigns/loss.toml --runs 200",
     "ctl": "uavctl ctl status",
+    "ctl takeoff": "uavctl ctl takeoff 1.2 --arm",
     "ctl goto": "uavctl ctl goto 2 1 -1.2",
     "ctl hold": "uavctl ctl hold",
     "ctl resume": "uavctl ctl resume",

@@ -17,7 +17,7 @@ MAX_LATENCY_S = 2.0  # no camera system is slower; 3 ms in milliseconds is above
 
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
-    """Requests to the vehicle (docs/hand-over.md); only `--arm --takeoff` arms."""
+    """Requests to the vehicle (docs/hand-over.md); only `--arm` arms."""
 
     answer_s: Annotated[float, declare("time until a request without an effect is repeated", "s", 0.2, 10)] = 1.0
     retry_s: Annotated[float, declare("time until a request refused for now is repeated", "s", 0.2, 10)] = 2.0

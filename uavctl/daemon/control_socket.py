@@ -25,7 +25,7 @@ from uavctl.config import Config
 from uavctl.config.checks import find_outside
 from uavctl.daemon.health import Health
 from uavctl.daemon.runtime_folder import find_runtime_folders
-from uavctl.errors import UsageError, VehicleTakenError
+from uavctl.errors import UsageError, VehicleTakenError, in_words
 from uavctl.event_codes import EventCode
 from uavctl.records import CellMessage, CellReport, Command, Event, Order, Ticked, Vec3
 
@@ -39,8 +39,10 @@ _MAX_PATH = 107  # bytes that the kernel takes for the path of a socket
 class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """Status request, order, or cell of the coordinator."""
 
-    ask: Literal["goto", "hold", "resume", "land", "engage", "status", "cell"]
+    ask: Literal["goto", "hold", "resume", "land", "engage", "take-off", "status", "cell"]
     position_m: Vec3 | None = None  # local NED; with goto only
+    height_m: float | None = None  # above the ground; with take-off only
+    arm: bool = False  # with take-off only: the vehicle may be armed
     cell: CellMessage | None = None  # with cell only; None: the report alone is wanted
     may_take_off: bool = False  # with cell only: all vehicles are known, and stand apart
 
@@ -50,6 +52,12 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
         if self.position_m is not None and not all(map(math.isfinite, self.position_m)):
             return "position_m has to be finite"
+        if self.ask != "take-off" and (self.height_m is not None or self.arm):
+            return f"{self.ask} takes no height_m and no arm"
+        if self.ask == "take-off" and not self.arm:
+            return "take-off needs arm: it permits arming the vehicle"
+        if self.ask == "take-off" and not (self.height_m is not None and 0.0 < self.height_m < math.inf):
+            return f"take-off needs a height_m above the ground, not {self.height_m}"
         if self.ask != "cell" and (self.cell is not None or self.may_take_off):
             return f"{self.ask} takes no cell"
         return None
@@ -130,6 +138,22 @@ class OrderReceiver(Protocol):
         ...
 
 
+class TakeOffChecker(Protocol):
+    """Check before arming, which takes many ticks."""
+
+    def begin(self, height_m: float, at_ns: int) -> str:
+        """Begin a check before a climb [m]; return why none may begin, empty if it has begun."""
+        ...
+
+    def update(self, at_ns: int) -> str | None:
+        """Continue the check; return the reasons not to arm, empty without one, None before its end."""
+        ...
+
+    def cancel(self) -> None:
+        """End the check without a result."""
+        ...
+
+
 @dataclass(eq=False)
 class _Client:
     socket: socket.socket
@@ -143,6 +167,7 @@ class ControlServer:
     Args:
         config: For the limits of a position.
         permit_take_off: Called once the coordinator of the cells permits the take-off.
+        take_off_checker: Check before an ordered take-off; without one the order is refused.
     """
 
     def __init__(
@@ -152,29 +177,34 @@ class ControlServer:
         order_receiver: OrderReceiver,
         make_health: Callable[[], Health],
         permit_take_off: Callable[[], None] = lambda: None,
+        take_off_checker: TakeOffChecker | None = None,
     ) -> None:
         self._listener, self._config, self._order_receiver = listener, config, order_receiver
         self._make_health, self._permit_take_off = make_health, permit_take_off
         self._clients: list[_Client] = []
         self._pending: list[tuple[_Client, Command]] = []  # for the next tick's answers
+        self._take_off_checker = take_off_checker
+        self._checked: tuple[_Client, Command] | None = None  # a take-off, while its check runs
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """Answer the orders of the tick, then read new requests; bounded work, no waiting."""
         del lateness_ns
         self._send_answers(list(ticked.answers))
         self._accept(ticked.decision.at_ns)
-        waiting = [client for client, _ in self._pending]
+        self._continue_check(ticked.decision.at_ns)
+        waiting = [client for client, _ in (*self._pending, *([self._checked] if self._checked else ()))]
         for idle in [client for client in self._clients if client not in waiting]:
             self._serve(idle, ticked.decision.at_ns)
 
     def close(self) -> None:
         """End the service; clients that still wait get a refusal."""
-        for client, _ in self._pending:
+        for client, _ in (*self._pending, *([self._checked] if self._checked else ())):
             self._reply(client, Reply(ok=False, text="the flight ended before a decision on this order"))
         for client in self._clients:
             client.socket.close()
         self._clients.clear()
         self._pending.clear()
+        self._checked = None
 
     def _send_answers(self, answers: list[tuple[Command, Event]]) -> None:
         waiting, self._pending = self._pending, []
@@ -185,6 +215,29 @@ class ControlServer:
             else:
                 answers.remove(answer)
                 self._reply(client, Reply(ok=answer[1].code == EventCode.ORDER_ACCEPTED, text=answer[1].text))
+
+    def _continue_check(self, now_ns: int) -> None:
+        """Order the take-off once its check has ended, if its client still waits for it."""
+        if self._checked is None or self._take_off_checker is None:
+            return
+        client, command = self._checked
+        if _has_hung_up(client.socket):
+            self._checked = None
+            self._take_off_checker.cancel()
+            self._drop(client)
+            return
+        try:
+            refusal = self._take_off_checker.update(now_ns)
+        except Exception as error:  # noqa: BLE001 other orders are taken all the same
+            self._take_off_checker.cancel()
+            refusal = f"not armed, because the check has failed: {in_words(error)}"
+        if refusal is None:
+            return
+        self._checked = None
+        if refusal:
+            self._reply(client, Reply(ok=False, text=refusal))
+        else:
+            self._order(client, command)
 
     def _accept(self, now_ns: int) -> None:
         while len(self._clients) < MAX_CLIENTS:
@@ -215,14 +268,14 @@ class ControlServer:
         line, separator, rest = client.buffer.partition(b"\n")
         if separator and len(line) <= MAX_LINE:
             client.buffer = rest
-            self._handle_request(client, line)
+            self._handle_request(client, line, now_ns)
         elif len(client.buffer) > MAX_LINE:
             self._reply(client, Reply(ok=False, text=f"a request has {MAX_LINE} bytes at most"))
             self._drop(client)
         elif data == b"" or now_ns - client.heard_ns > IDLE_NS:
             self._drop(client)
 
-    def _handle_request(self, client: _Client, line: bytes) -> None:
+    def _handle_request(self, client: _Client, line: bytes, now_ns: int) -> None:
         try:
             request = _REQUEST.decode(line)
         except msgspec.MsgspecError as error:  # of msgspec's own, a subclass of ValueError
@@ -238,12 +291,27 @@ class ControlServer:
             request.find_problem()
             or self._check_position(request)
             or self._order_receiver.explain_refusal(Order(request.ask))
-            or None
+            or self._begin_check(request, now_ns)
         )
-        if problem is not None:
+        if problem:
             self._reply(client, Reply(ok=False, text=problem))
             return
-        command = Command(order=Order(request.ask), position_m=request.position_m)
+        command = Command(order=Order(request.ask), position_m=request.position_m, height_m=request.height_m)
+        if command.order is Order.TAKE_OFF:
+            self._checked = (client, command)
+        else:
+            self._order(client, command)
+
+    def _begin_check(self, request: ControlRequest, now_ns: int) -> str:
+        """Begin the check before a take-off; return why it is refused, empty if it has begun or for another order."""
+        if request.height_m is None:
+            return ""
+        if self._take_off_checker is None:
+            return "this flight takes no order to take off"
+        return self._take_off_checker.begin(request.height_m, now_ns)
+
+    def _order(self, client: _Client, command: Command) -> None:
+        """Queue an order; its client gets the answer of the next tick."""
         if self._order_receiver.order(command):
             self._pending.append((client, command))
         else:
@@ -282,6 +350,16 @@ class ControlServer:
         if client in self._clients:
             self._clients.remove(client)
             client.socket.close()
+
+
+def _has_hung_up(connection: socket.socket) -> bool:
+    """Return whether the other end has closed the connection; what it sends else stays unread."""
+    try:
+        return connection.recv(1, socket.MSG_PEEK) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 @contextmanager

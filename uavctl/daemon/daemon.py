@@ -54,7 +54,7 @@ def fly(
     stop_requested: Callable[[], bool],
     *,
     duration_s: float | None = None,
-    stop_limit_s: float,
+    stop_limit_s: Callable[[], float],
     give_orders: AfterTick = lambda *_: None,
     after_tick: Sequence[AfterTick] = (),
     limit_tick: Callable[[bool], AbstractContextManager[None]] = lambda _: nullcontext(),
@@ -104,7 +104,7 @@ class _Flight:
 
     stop_requested: Callable[[], bool]
     duration_s: float | None
-    stop_limit_s: float
+    stop_limit_s: Callable[[], float]
     give_orders: AfterTick
     services: Sequence[AfterTick]
     limit_tick: Callable[[bool], AbstractContextManager[None]]
@@ -224,8 +224,9 @@ class _Flight:
         if self._stop_ns is None and (is_time_over or self.stop_requested()):
             self._stop_ns = at_ns
             self._loop.account.note_requested_end(Cause.TIME_OVER if is_time_over else Cause.ENDED_BY_OPERATOR)
-        is_overdue = self._stop_ns is not None and at_ns - self._stop_ns >= self.stop_limit_s * 1e9
-        return is_overdue and not (self.stop_limit_s and self._loop.is_relay_needed)
+        limit_s = self.stop_limit_s()
+        is_overdue = self._stop_ns is not None and at_ns - self._stop_ns >= limit_s * 1e9
+        return is_overdue and not (limit_s and self._loop.is_relay_needed)
 
     def _send(self, message: Outgoing) -> None:
         if message.link == VEHICLE and not self._reader.is_fresh:

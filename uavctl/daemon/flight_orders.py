@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from uavctl.config import Config
 from uavctl.errors import UsageError
+from uavctl.flight.mission import RestRegion
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import LAND_PERIODS
 from uavctl.mavlink.handover_states import HandoverState
@@ -113,21 +114,29 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
         UsageError: the plant may not rest at the goal, or the climb would end above the room.
         DesignError: the mission does not fit the design.
     """
-    if take_off_m is not None and "down" not in design.plant.axes:
-        raise UsageError("take-off: the plant has no vertical axis, so its height is unknown; see plant.axes")
     if take_off_m is None and goal is None:
         return
     region = build_mission(config, design, compute_reference_limits(design)).rest_region
-    if region is None:
-        raise UsageError("take-off, goto: this plant cannot rest at every target; see plant")
-    refusal = "" if goal is None else region.describe_refusal(goal)
+    refusal = "" if take_off_m is None else explain_height_refusal(region, take_off_m)
+    if refusal:
+        raise UsageError(refusal)
+    if goal is not None and region is None:
+        raise UsageError("goto: this plant cannot rest at every target; see plant")
+    refusal = "" if goal is None or region is None else region.describe_refusal(goal)
     if refusal:
         raise UsageError(f"goto: {refusal}")
-    if take_off_m is None:
-        return
+
+
+def explain_height_refusal(region: RestRegion | None, take_off_m: float) -> str:
+    """Return why the plant may not climb to a height above the ground [m] and rest there; empty if it may."""
+    if region is None:
+        return "take-off: this plant cannot rest at every target; see plant"
+    if DOWN not in region.axes:
+        return "take-off: the plant has no vertical axis, so its height is unknown; see plant.axes"
     highest_m = -float(region.lower[region.axes.index(DOWN)])
     if take_off_m > highest_m:
-        raise UsageError(f"take-off to {take_off_m:g} m: above {highest_m:.2f} m it may not rest (sets.state_lower)")
+        return f"take-off to {take_off_m:g} m: above {highest_m:.2f} m it may not rest (sets.state_lower)"
+    return ""
 
 
 def compute_stop_limit_s(config: Config, *, takes_off: bool) -> float:

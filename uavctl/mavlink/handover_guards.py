@@ -153,6 +153,21 @@ def explain_engage_refusal(state: HandoverState, inputs: HandoverInput) -> str:
     return inputs.arming_refusal
 
 
+def explain_take_off_refusal(state: HandoverState, vehicle: VehicleStatus | None, *, is_ordered_flight: bool) -> str:
+    """Return why a running flight must not arm and take off; empty if it may: it stands by, before its first flight."""
+    if state is HandoverState.WAITING or vehicle is None:
+        return "no vehicle is heard"
+    if state is not HandoverState.READY or is_ordered_flight:
+        return f"take-off is possible once, from the ground (state: {state})"
+    if vehicle.armed:
+        return "the vehicle is already armed; a take-off begins disarmed, on the ground: land and disarm it"
+    if vehicle.landed is False:
+        return "the vehicle reports that it is in the air"
+    if vehicle.autopilot not in PROFILES:
+        return f"autopilot {vehicle.autopilot!r} is not supported; use PX4 or ArduCopter"
+    return "" if vehicle.alone else "another vehicle is heard on this link; give each its own link"
+
+
 def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) -> str:
     """Return the reason why an order to move would have no effect; empty while the controller flies."""
     if state is HandoverState.ENGAGED:
