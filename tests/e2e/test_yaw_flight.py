@@ -94,6 +94,23 @@ def test_a_given_angle_is_flown_at_a_limited_rate_and_replays(
 
 @pytest.mark.slow
 @BOTH
+def test_each_waypoint_of_a_file_is_reached_with_its_own_yaw(preset: str, autopilot: str, tmp_path: Path) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text("yaw,x,y,z\n90,0,-1,1.2\n-45,0,1,1.2\n")  # ENU: nose north, then south-east
+    keys = (f"mission.file={file}", "mission.file_axes=enu", "mission.hold_s=5", "sim.start_position_m=[0,0,-1.2]")
+    path = tmp_path / "flight.mcap"
+    seen = fly_truth(preset, autopilot, *keys, seconds=16.0, path=path)
+    assert_undisturbed(seen)
+    rows = zip(seen.places_m, seen.headings_rad, strict=True)
+    there_rad = [heading for place, heading in rows if math.dist(place, (-1.0, 0.0, -1.2)) < 0.15]
+    assert there_rad and math.degrees(there_rad[len(there_rad) // 2]) == pytest.approx(0.0, abs=5.0)
+    assert math.dist(seen.places_m[-1], (1.0, 0.0, -1.2)) < 0.1
+    assert math.degrees(seen.headings_rad[-1]) == pytest.approx(135.0, abs=5.0)
+    assert run(["log", "replay", str(path)]) == 0
+
+
+@pytest.mark.slow
+@BOTH
 def test_along_the_path_the_nose_leads_each_leg_and_stays_at_rest(preset: str, autopilot: str) -> None:
     legs = (
         "mission.waypoints=[[1.6,-1.5,-1.2],[1.6,1.6,-1.2]]",

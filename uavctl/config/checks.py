@@ -105,6 +105,12 @@ def _check_yaw(plant: PlantConfig, mission: MissionConfig) -> Iterator[ConfigPro
         yield ConfigProblem(
             "mission.yaw_deg", f'mission.yaw is "{mission.yaw}"', 'set mission.yaw = "angle", or remove it'
         )
+    if isinstance(mission.yaw_deg, tuple) and len(mission.yaw_deg) != len(mission.waypoints):
+        yield ConfigProblem(
+            "mission.yaw_deg",
+            f"has {len(mission.yaw_deg)} entries, there are {len(mission.waypoints)} waypoints",
+            "give one number, or one for each waypoint",
+        )
     if mission.yaw == "path" and not {"north", "east"} <= set(plant.axes):
         yield ConfigProblem("mission.yaw", "the plant does not move north and east", 'give "hold" or "angle"')
 

@@ -44,7 +44,7 @@ from uavctl.config.document import (
     read_text,
 )
 from uavctl.config.link import LinkConfig, read_trace_file
-from uavctl.config.mission import MissionConfig, read_trajectory_file
+from uavctl.config.mission import MissionConfig, read_mission_file
 from uavctl.config.room import ROOM_KEYS, RoomConfig, apply_room, merge_tables
 from uavctl.config.sim import MAX_FAULTS, FaultConfig, check_faults
 from uavctl.config.types import HAHN_STURSBERG_KEYS, Config
@@ -222,7 +222,7 @@ def _parse(table: dict[str, Any], text: str, file: str, overrides: Sequence[str]
     problems.extend(_find_foreign_keys(table))
     mission, link = sections.get("mission", MissionConfig()), sections.get("link", LinkConfig())
     if isinstance(mission, MissionConfig) and isinstance(link, LinkConfig):
-        mission, mission_places = read_trajectory_file(mission, Path(file).parent, problems)
+        mission, mission_places = read_mission_file(mission, Path(file).parent, problems)
         is_override = any(key == "link.trace_file" for key, _ in source.overrides)
         link, link_places = read_trace_file(link, Path() if is_override else Path(file).parent, problems)
         sections |= {"mission": mission, "link": link}

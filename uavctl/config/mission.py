@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -27,6 +28,9 @@ from uavctl.config.document import (
     refuse_file,
 )
 from uavctl.config.polynomials import has_polynomials, sample_polynomials
+
+MAX_WAYPOINTS = 1000
+Angle = Annotated[float, Meta(ge=-180, le=180)]
 
 
 class TrajectoryConfig(Section, frozen=True, kw_only=True):
@@ -59,7 +63,17 @@ class TrajectoryConfig(Section, frozen=True, kw_only=True):
 class MissionConfig(Section, frozen=True, kw_only=True):
     """Waypoints, or a trajectory; with neither, `target.position_m` is held."""
 
-    waypoints: Annotated[tuple[Position, ...], declare("positions to fly to, local NED", "m", length=1000)] = ()
+    waypoints: Annotated[
+        tuple[Position, ...], declare("positions to fly to, local NED", "m", length=MAX_WAYPOINTS)
+    ] = ()
+    file: Annotated[
+        str,
+        declare(
+            "CSV file of waypoints, beside this one; header: x, y, z, perhaps yaw [deg], or as in `north_m`, `yaw_rad`",
+            length=MAX_PATH_LENGTH,
+        ),
+    ] = ""
+    file_axes: Annotated[Literal["ned", "enu"], declare("its x, y, z and yaw; `enu`: yaw from east to north")] = "ned"
     hold_s: Annotated[
         Number | Annotated[Floats, Meta(max_length=1000)], declare("time at each waypoint: one, or a list", "s")
     ] = 0.0
@@ -72,7 +86,10 @@ class MissionConfig(Section, frozen=True, kw_only=True):
         Literal["hold", "path", "angle"],
         declare("`hold` (no yaw setpoint), `path` (along the planned motion, from 0.3 m/s on) or `angle` (yaw_deg)"),
     ] = "hold"
-    yaw_deg: Annotated[Annotated[float, Meta(ge=-180, le=180)] | None, declare("clockwise from north", "deg")] = None
+    yaw_deg: Annotated[
+        Angle | Annotated[tuple[Angle, ...], Meta(max_length=MAX_WAYPOINTS)] | None,
+        declare("clockwise from north: one, or a list", "deg"),
+    ] = None
     yaw_rate_dps: Annotated[float, declare("fastest turn; ArduPilot's own limit is 60", "deg/s", 1, 360)] = 60.0
     trajectory: TrajectoryConfig = TrajectoryConfig()
     cells: Annotated[bool, declare("fly in the moving cells of a fleet's coordinator only; see `uavctl fleet`")] = False
@@ -96,10 +113,10 @@ _MAX_SHOWN = 40  # characters of a cell that is none
 _LISTS = ("times_s", "positions_m", "velocities_mps")
 
 
-def read_trajectory_file(
+def read_mission_file(
     mission: MissionConfig, folder: Path, problems: list[ConfigProblem]
 ) -> tuple[MissionConfig, dict[str, str]]:
-    """The samples of `mission.trajectory.file` in its place, so that the configuration is complete in itself.
+    """Put the content of the mission's file in its place, so that the configuration is complete in itself.
 
     Args:
         folder: Where a relative name starts from.
@@ -108,6 +125,8 @@ def read_trajectory_file(
     Returns:
         The mission, and where the keys that come from the file stand: `file:line`, or the file for a whole list.
     """
+    if mission.file:
+        return _read_waypoint_file(mission, folder, problems)
     trajectory, key = mission.trajectory, "mission.trajectory.file"
     if not trajectory.file:
         return mission, {}
@@ -134,6 +153,34 @@ def read_trajectory_file(
     return msgspec.structs.replace(mission, trajectory=samples), places
 
 
+def _read_waypoint_file(
+    mission: MissionConfig, folder: Path, problems: list[ConfigProblem]
+) -> tuple[MissionConfig, dict[str, str]]:
+    """Return the mission with the waypoints of its file, and the line of each."""
+    path = folder / mission.file
+    if mission.waypoints or mission.trajectory != TrajectoryConfig() or mission.yaw_deg is not None:
+        reason, todo = "waypoints, a trajectory or yaw_deg are given as well", "keep the file, or write its rows there"
+        problems.append(ConfigProblem("mission.file", reason, todo))
+        return mission, {}
+    try:
+        rows = _read_waypoint_rows(path, is_enu=mission.file_axes == "enu")
+    except DataFileError as error:
+        problems.extend(ConfigProblem("mission.file", reason, "correct the file") for reason in error.reasons)
+        return mission, {}
+    yaws_deg = tuple(row[3] for _, row in rows if len(row) > len(_AXES))
+    if yaws_deg and mission.yaw == "path":
+        problems.append(ConfigProblem("mission.yaw", "the file has a column for yaw", "remove one of them"))
+    filled = msgspec.structs.replace(
+        mission,
+        file="",
+        file_axes="ned",
+        waypoints=tuple(_make_vector(row[:3]) for _, row in rows),
+        **({"yaw": "angle", "yaw_deg": yaws_deg} if yaws_deg else {}),
+    )
+    places = {name: str(path) for name in ("mission.waypoints", "mission.yaw_deg")}
+    return filled, places | {f"mission.waypoints[{i}]": f"{path}:{line}" for i, (line, _) in enumerate(rows)}
+
+
 # Quantity and sign of the words in a header, and the factors of units.
 _QUANTITIES = {
     **dict.fromkeys(("t", "time", "stamp", "timestamp"), ("t", 1.0)),
@@ -141,11 +188,16 @@ _QUANTITIES = {
     **dict.fromkeys(("y", "east", "e"), ("y", 1.0)),
     **dict.fromkeys(("z", "down", "d"), ("z", 1.0)),
     **dict.fromkeys(("height", "up", "altitude", "alt", "h"), ("z", -1.0)),
+    "yaw": ("yaw", 1.0),
 }
+_ENU_QUANTITIES = {**_QUANTITIES, "x": ("y", 1.0), "y": ("x", 1.0), "z": ("z", -1.0)}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 _METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "km": 1000.0}
 _SPEEDS = {unit + form: factor for unit, factor in _METRES.items() for form in ("ps", "/s")} | {"km/h": 1.0 / 3.6}
-_UNITS = {"t": _SECONDS, **dict.fromkeys(("x", "y", "z"), _METRES), **dict.fromkeys(("vx", "vy", "vz"), _SPEEDS)}
+_AXES = ("x", "y", "z")
+_UNITS = {"t": _SECONDS, **dict.fromkeys(_AXES, _METRES), **dict.fromkeys(("vx", "vy", "vz"), _SPEEDS)}
+_WAYPOINT_UNITS = {**dict.fromkeys(_AXES, _METRES), "yaw": {"deg": 1.0, "°": 1.0, "rad": math.degrees(1.0)}}
+_MAX_YAW_DEG = 360.0
 # A word for position or velocity, a quantity, and a unit after `_` or in brackets: `pos_x`, `v_north [cm/s]`.
 _HEADING = re.compile(
     rf"(?:p|pos|position|(?P<velocity>v|vel|velocity|speed))?[_\s.\-]*+(?P<quantity>{'|'.join(_QUANTITIES)})"
@@ -160,30 +212,41 @@ class StatedColumn(NamedTuple):
     factor: float
 
 
-def parse_heading(cell: str) -> tuple[str, float, str] | None:
+def parse_heading(
+    cell: str, quantities: Mapping[str, tuple[str, float]] = _QUANTITIES
+) -> tuple[str, float, str] | None:
     """Return the quantity of a heading (`t`, `x`, `vx` …), its sign and its unit, or empty; None for no quantity."""
     match = _HEADING.fullmatch(cell.strip(" \"'").lower())
     if match is None:
         return None
-    name, sign = _QUANTITIES[match["quantity"]]
+    name, sign = quantities[match["quantity"]]
     return ("v" if match["velocity"] else "") + name, sign, (match["unit"] or "").strip()
 
 
-def read_header(cells: Sequence[str]) -> tuple[dict[str, StatedColumn], list[str]]:
-    """Return the columns of a header by quantity, and its errors."""
+def read_header(
+    cells: Sequence[str],
+    units: Mapping[str, Mapping[str, float]] = _UNITS,
+    quantities: Mapping[str, tuple[str, float]] = _QUANTITIES,
+) -> tuple[dict[str, StatedColumn], list[str]]:
+    """Return the columns of a header by quantity, and its errors.
+
+    Args:
+        units: Factors of the units of each quantity that may stand there.
+        quantities: Quantity and sign of each word.
+    """
     columns: dict[str, StatedColumn] = {}
     problems: list[str] = []
     for index, cell in enumerate(cells):
         label = f'column {index + 1}, "{cell.strip()[:_MAX_SHOWN]}"'
-        name, sign, unit = parse_heading(cell) or ("", 1.0, "")
-        if name not in _UNITS:
+        name, sign, unit = parse_heading(cell, quantities) or ("", 1.0, "")
+        if name not in units:
             problems.append(f"{label}, is not a quantity that is known here; rename or remove the column")
-        elif unit and unit not in _UNITS[name]:
-            problems.append(f'{label}: "{unit}" is not a unit of it; give one of {", ".join(_UNITS[name])}')
+        elif unit and unit not in units[name]:
+            problems.append(f'{label}: "{unit}" is not a unit of it; give one of {", ".join(units[name])}')
         elif name in columns:
             problems.append(f"{label}, means the same as column {columns[name].column + 1}; keep one of them")
         else:
-            columns[name] = StatedColumn(index, sign * (_UNITS[name][unit] if unit else 1.0))
+            columns[name] = StatedColumn(index, sign * (units[name][unit] if unit else 1.0))
     return columns, problems
 
 
@@ -249,6 +312,56 @@ def _read_columns(
         problems.append(f"the header has no column for {', '.join(missing)}; {_FORMAT_HINT}")
     refuse_file(path, [f"{path}:{line}: {reason}" for reason in problems])
     return [columns[name] for name in required], rows
+
+
+def _read_waypoint_rows(path: Path, *, is_enu: bool) -> list[tuple[int, Floats]]:
+    """Return line number and x, y, z and perhaps yaw of each row, in local NED [m] and clockwise from north [deg].
+
+    Args:
+        is_enu: x is east, y north, z up, and yaw turns from east to north.
+    """
+    lines = [(number, text) for number, line in enumerate(read_row_lines(path), 1) if (text := line.strip())]
+    rows = [(number, text.split(",")) for number, text in lines if not text.startswith("#")]
+    if not rows or any(parse_number(cell) is not None for cell in rows[0][1]):
+        raise DataFileError((f"{path}:{rows[0][0] if rows else 1}: has no header; give x, y, z and perhaps yaw",))
+    if not 0 < len(rows) - 1 <= MAX_WAYPOINTS:
+        raise DataFileError((f"{path}: has {len(rows) - 1} waypoints; give 1 to {MAX_WAYPOINTS}",))
+    (header_line, header), rows = rows[0], rows[1:]
+    columns, problems = read_header(header, _WAYPOINT_UNITS, _ENU_QUANTITIES if is_enu else _QUANTITIES)
+    if not problems and (missing := [axis for axis in _AXES if axis not in columns]):
+        problems.append(f"the header has no column for {', '.join(missing)} of local NED; add it")
+    refuse_file(path, [f"{path}:{header_line}: {reason}" for reason in problems])
+    refuse_file(
+        path, [f"{path}:{line}: {reason}" for line, cells in rows for reason in _find_waypoint_problems(cells, header)]
+    )
+    used = [columns[name] for name in _WAYPOINT_UNITS if name in columns]
+    values = [(line, [float(cells[column.column]) * column.factor for column in used]) for line, cells in rows]
+    refuse_file(
+        path,
+        [
+            f"{path}:{line}: column {columns['yaw'].column + 1}, yaw: {row[3]:g} deg is beyond a turn; give -180 to 180"
+            for line, row in values
+            if len(row) > len(_AXES) and abs(row[3]) > _MAX_YAW_DEG
+        ],
+    )
+    # ψ = 90° - ψ_ENU: clockwise from north
+    return [
+        (line, (*row[:3], *(math.remainder(90.0 - yaw_deg if is_enu else yaw_deg, 360.0) for yaw_deg in row[3:])))
+        for line, row in values
+    ]
+
+
+def _find_waypoint_problems(cells: list[str], header: list[str]) -> Iterator[str]:
+    """Yield the errors in a row of waypoints, each with its column."""
+    if len(cells) != len(header):
+        yield f"has {len(cells)} columns, the header has {len(header)}; give one number for each"
+        return
+    for number, (cell, heading) in enumerate(zip(cells, header, strict=True), 1):
+        value, label = parse_number(cell), f"column {number}, {heading.strip()[:_MAX_SHOWN]}"
+        if value is None:
+            yield f'{label}: "{cell.strip()[:_MAX_SHOWN]}" is not a finite number; give one'
+        elif abs(value) > MAX_NUMBER:
+            yield f"{label}: {value:g} is beyond {MAX_NUMBER:g}; check its unit"
 
 
 def _make_vector(values: Floats) -> tuple[float, float, float]:

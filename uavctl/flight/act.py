@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import msgspec
+from msgspec.structs import replace
 
 from uavctl.arrays import Array
 from uavctl.flight.context import FilterView, TickContext, expand_axes, read_position, read_velocity
@@ -99,9 +100,11 @@ def _compute_yaw(state: ControlState, context: TickContext, decided: Decided) ->
         plant = controller.plant
         planned_mps = expand_axes(plant, plan.states[context.step - plan.seq].tolist(), plant.velocity_index, 0.0)
     tick_s = controller.tick_ns * 1e-9
-    return compute_yaw(
-        state.plan.sent_yaw_rad, context.inputs.motion, planned_mps, context.at_ns, tick_s, controller.yaw
-    )
+    progress, yaw = state.mission.progress, controller.yaw
+    waypoint_rad = controller.mission.waypoints[0 if progress is None else progress.waypoint].yaw_rad
+    if waypoint_rad is not None:
+        yaw = replace(yaw, angle_rad=waypoint_rad)
+    return compute_yaw(state.plan.sent_yaw_rad, context.inputs.motion, planned_mps, context.at_ns, tick_s, yaw)
 
 
 def _compute_fallback_accel(fallback: Fallback, context: TickContext, supervised: Supervised, decided: Decided) -> Vec3:

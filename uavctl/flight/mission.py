@@ -26,6 +26,7 @@ class Waypoint:
 
     target: Array  # equilibrium there (n_x,)
     hold_ns: int  # time to stay, from the arrival on [ns]; the last one is held to the end
+    yaw_rad: float | None = None  # on the way there and there, clockwise from north; None: that of the whole mission
 
 
 @dataclass(frozen=True, eq=False)

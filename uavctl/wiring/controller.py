@@ -446,7 +446,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
     check_axes(config)
     design = build_flight_design(config) if design is None else design
     estimator, fallback = config.estimator, config.fallback
-    plant, outside = build_plant(config), config.smpc.controller
+    plant, outside, yaw_deg = build_plant(config), config.smpc.controller, config.mission.yaw_deg
     return Controller(
         plant=plant,  # the plant of the design may be the one of the estimator
         design_id=design.design_id,
@@ -461,7 +461,8 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
         envelope=build_envelope(config, plant),
         yaw=YawParameters(
             mode=YawMode(config.mission.yaw),
-            angle_rad=math.radians(config.mission.yaw_deg or 0.0),
+            # Of a list, each waypoint has its own angle.
+            angle_rad=0.0 if isinstance(yaw_deg, tuple) else math.radians(yaw_deg or 0.0),
             rate_rps=math.radians(config.mission.yaw_rate_dps),
         ),
         estimator=build_estimator(config),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -49,9 +50,13 @@ def build_mission(config: Config, design: AnyDesign, reference_limits: Array) ->
             if isinstance(mission_config.hold_s, tuple)
             else (mission_config.hold_s,) * len(mission_config.waypoints)
         )
+        yaw_deg = mission_config.yaw_deg
+        yaws_rad: tuple[float | None, ...] = (
+            tuple(map(math.radians, yaw_deg)) if isinstance(yaw_deg, tuple) else (None,) * len(holds_s)
+        )
         waypoints = tuple(
-            Waypoint(plant.equilibrium(position_m), round(hold_s * SECOND_NS))
-            for position_m, hold_s in zip(mission_config.waypoints, holds_s, strict=True)
+            Waypoint(plant.equilibrium(position_m), round(hold_s * SECOND_NS), yaw_rad)
+            for position_m, hold_s, yaw_rad in zip(mission_config.waypoints, holds_s, yaws_rad, strict=True)
         )
         mission = replace(mission, waypoints=waypoints, accept_m=mission_config.accept_m)
     return replace(

@@ -19,7 +19,7 @@ from logs.recording.mavros import make_unwrapper
 from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.config.document import find_excess, find_key_lines, read_text
-from uavctl.config.mission import MissionConfig, TrajectoryConfig, read_trajectory_file
+from uavctl.config.mission import MissionConfig, TrajectoryConfig, read_mission_file
 from uavctl.errors import RecordingError
 
 FRAME = rows_of(TLOGS[0])[0][3]
@@ -96,7 +96,7 @@ def read_toml(path: Path) -> None:
 
 def read_trajectory(path: Path) -> None:
     mission = MissionConfig(trajectory=TrajectoryConfig(file=path.name))
-    read, _ = read_trajectory_file(mission, path.parent, [])
+    read, _ = read_mission_file(mission, path.parent, [])
     assert read.trajectory.times_s
 
 
