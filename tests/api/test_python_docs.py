@@ -106,10 +106,19 @@ def test_a_notebook_is_whole_and_public(path: Path) -> None:
     assert "/tmp" not in text
 
 
-def test_there_are_two_notebooks_that_the_page_links_to() -> None:
+def test_there_are_three_notebooks_that_the_page_links_to() -> None:
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
-    assert len(NOTEBOOKS) == 2
+    assert len(NOTEBOOKS) == 3
     assert all(f"(notebooks/{path.name})" in text for path in NOTEBOOKS)
+
+
+def test_the_comparison_states_only_figures_that_it_printed() -> None:
+    book = nbformat.read(ROOT / "docs" / "notebooks" / "comparison.ipynb", as_version=4)
+    (verdict,) = (cell.source for cell in book.cells if cell.source.startswith("## What comes out"))
+    printed = re.findall(r"\d+\.\d+", " ".join(get_printed_text(cell) for cell in book.cells if "outputs" in cell))
+    stated = re.findall(r"\d+\.\d+", verdict)
+    assert len(stated) >= 5
+    assert set(stated) <= set(printed)
 
 
 @pytest.mark.slow
