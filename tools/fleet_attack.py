@@ -5,6 +5,7 @@ process serves. Each attack is made when two vehicles are near to each other. Ev
 the system permits that. Only processes that were started here are signalled.
 
     python tools/fleet_attack.py [--attack cameras-killed ...] [--rounds 1] [--json]
+    python tools/fleet_attack.py --attack none --vehicles 8     # eight vehicles in real time, in a room of 6 m
 
 Exit code 1: two vehicles collided, or one is still in the air at the end but for one that its pilot flies, or two never
 came near to each other, so that nothing was attacked.
@@ -22,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+import tomllib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
@@ -32,24 +34,27 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from logs.recording.export import read_table
 from sim.fleet import make_fleet
 from sim.server import serve_all
 from sim.simulation import Peers
 from uavctl.config import load_config
+from uavctl.errors import UavctlError
 from uavctl.records import Truth
 
 ROOT = Path(__file__).resolve().parents[1]
-VEHICLES = 4
 NEAR_M = 1.6  # distance of a pair at which the attack begins: within cells d is 0.35 m, at their starts 1 m or more
 AWAY_M = 0.5  # way that both have flown by then
 IN_AIR_M = 0.3  # height above which a vehicle is in the air
 START_LIMIT_S, CROSS_S, END_LIMIT_S = 90.0, 25.0, 90.0
 PX4_POSCTL = (1 | 80, 3 << 16)  # base mode with custom mode and manual input; PX4 main mode POSCTL
-SETS = (
-    "sim.start_position_m=[-0.6,-0.5,-0.2]",
-    "sets.state_upper=[3,1.5,inf,0.9,1.5,inf,0,1,inf]",
-    "target.position_m=[0,0,-1.2]",
-    "sim.camera.rate_hz=50",
+FLEET_FILE = "cross.toml"
+FIRST_START_M = {4: (-0.6, -0.5), 8: (-0.6, -1.5)}  # north and east; the others stand 1 m apart in two rows
+ROOM = ("sets.state_lower=[-3,-1.5,-inf,-3,-1.5,-inf,-3,-1,-inf]", "sets.state_upper=[3,1.5,inf,3,1.5,inf,0,1,inf]")
+CALM = (  # as in the example
+    "limits.accel_mps2=[2.0, 2.0, 1.5]",
+    "sets.input_lower=[-2.0, -2.0, -1.5]",
+    "sets.input_upper=[2.0, 2.0, 1.5]",
 )
 
 
@@ -60,6 +65,8 @@ class Outcome:
     attack: str
     closest_m: float | None = None  # of all pairs, from the attack on
     collisions: int = 0
+    away_m: float | None = None  # largest distance from a target, north and east, before the end is ordered
+    missed_ticks: int | None = None  # of all daemons; None: a recording cannot be read
     in_air: int = 0  # vehicles in the air at the end
     fleet_code: int | None = None  # exit code of `uavctl fleet fly`; None: it had to be killed
     attacked_s: float | None = None  # when, since the start; None: two vehicles never came near
@@ -71,10 +78,11 @@ class Scene:
 
     Args:
         folder: Folder for recordings and outputs.
+        vehicles: Number of vehicles.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, vehicles: int) -> None:
+        self.folder, self.vehicles = folder, vehicles
         self.truths: dict[int, Truth] = {}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.blind: set[int] = set()
@@ -86,9 +94,20 @@ class Scene:
         self._thread = threading.Thread(target=self._serve, daemon=True)
 
     def _serve(self) -> None:
-        config = load_config("room-px4", list(SETS))
+        north_m, east_m = FIRST_START_M[self.vehicles]
+        last_m = east_m + self.vehicles // 2 - 1
+        config = load_config(
+            "room-px4",
+            [
+                f"sim.start_position_m=[{north_m},{east_m},-0.2]",
+                ROOM[0],
+                f"sets.state_upper=[3,1.5,inf,{last_m + 0.4},1.5,inf,0,1,inf]",  # where its row ends
+                "target.position_m=[0,0,-1.2]",
+                "sim.camera.rate_hz=50",
+            ],
+        )
         urls = "udpout://127.0.0.1:14540,udpout://127.0.0.1:14640"
-        setups = make_fleet(config, urls, "udpout://127.0.0.1:14660", VEHICLES, lambda _: None)
+        setups = make_fleet(config, urls, "udpout://127.0.0.1:14660", self.vehicles, lambda _: None)
         setups = tuple(replace(setup, on_truth=self._make_receiver(i)) for i, setup in enumerate(setups))
         send_position = Peers.send_position
 
@@ -123,7 +142,7 @@ class Scene:
 
     def __enter__(self) -> Scene:
         self._thread.start()
-        for _ in range(VEHICLES):
+        for _ in range(self.vehicles):
             if not self._ready.acquire(timeout=30.0):
                 raise SystemExit("the simulated vehicles do not start")
         return self
@@ -221,29 +240,66 @@ ATTACKS: dict[str, Callable[[Scene], object]] = {
     "blind": lambda scene: scene.blind.add(1),
     "exchanged": lambda scene: setattr(scene, "exchanged", (1, 2)),
     "pilot": take_over,
-    "second-cameras": lambda scene: scene.start("cameras-2", "cameras", "cross.toml"),
+    "second-cameras": lambda scene: scene.start("cameras-2", "cameras", FLEET_FILE),
     "second-fleet": lambda scene: scene.start(
-        "fleet-2", "fleet", "fly", "cross.toml", "--arm", "--takeoff", "1.2", "--out", "flights-2"
+        "fleet-2", "fleet", "fly", FLEET_FILE, "--arm", "--takeoff", "1.2", "--out", "flights-2"
     ),
     "foreign-positions": send_foreign_positions,
-    "land": lambda scene: scene.start("land", "fleet", "land", "cross.toml"),
+    "land": lambda scene: scene.start("land", "fleet", "land", FLEET_FILE),
     "interrupted": lambda scene: scene.processes["fleet"].send_signal(signal.SIGINT),
 }
 
 
-def attack(name: str, folder: Path) -> Outcome:
+def write_fleet_file(path: Path, vehicles: int) -> None:
+    """Write the example with four vehicles, or one like it with more in a larger room."""
+    text = (ROOT / "docs/examples" / FLEET_FILE).read_text()
+    if vehicles != 4:
+        text = text.partition("[[vehicle]]")[0]
+        north_m, east_m = FIRST_START_M[vehicles]
+        for number in range(vehicles):
+            row, place = divmod(number, vehicles // 2)
+            goal_m = -3.0 * (north_m + row) + 0.3, -1.2 * (east_m + place)  # from each row across the other one
+            text += f"""
+[[vehicle]]
+name = "vehicle-{number + 1}"
+config = "room-px4"
+vehicle = "udpin://0.0.0.0:{14540 + number}"
+mocap = "udpin://0.0.0.0:{14560 + number}"
+cameras = "udpin://0.0.0.0:{14660 + number}"
+set = {[*ROOM, *CALM, f"target.position_m=[{goal_m[0]:.2f}, {goal_m[1]:.2f}, -1.2]"]}
+"""
+    path.write_text(text)
+
+
+def read_targets_m(path: Path) -> Any:
+    """Read the targets (N, 2) of the vehicles of a fleet file."""
+    rows = [entry for vehicle in tomllib.loads(path.read_text())["vehicle"] for entry in vehicle["set"]]
+    return np.array([json.loads(row.partition("=")[2])[:2] for row in rows if row.startswith("target.position_m")])
+
+
+def count_missed_ticks(folder: Path) -> int | None:
+    """Count the ticks that the daemons missed, by their recordings."""
+    paths = sorted(folder.glob("*/flight.mcap"))
+    try:
+        return sum(int(read_table(path, "/uavctl/decision")["missed_ticks"].to_numpy().sum()) for path in paths)
+    except UavctlError:  # a daemon was killed while it wrote
+        return None
+
+
+def attack(name: str, folder: Path, vehicles: int) -> Outcome:
     """Fly, attack and judge."""
     outcome = Outcome(name)
     folder.mkdir(parents=True)
-    shutil.copy(ROOT / "docs/examples/cross.toml", folder)
-    with Scene(folder) as scene:
-        scene.start("cameras", "cameras", "cross.toml")
-        scene.start("fleet", "fleet", "fly", "cross.toml", "--arm", "--takeoff", "1.2", "--out", "flights")
+    write_fleet_file(folder / FLEET_FILE, vehicles)
+    targets_m = read_targets_m(folder / FLEET_FILE)
+    with Scene(folder, vehicles) as scene:
+        scene.start("cameras", "cameras", FLEET_FILE)
+        scene.start("fleet", "fleet", "fly", FLEET_FILE, "--arm", "--takeoff", "1.2", "--out", "flights")
         begun_s, begins_m, end_s, closest_m = time.monotonic(), None, None, np.inf
         while True:
             time.sleep(0.02)
             now_s = time.monotonic() - begun_s
-            if len(scene.truths) < VEHICLES:
+            if len(scene.truths) < vehicles:
                 continue
             if begins_m is None:
                 begins_m = scene.positions_m
@@ -259,6 +315,8 @@ def attack(name: str, folder: Path) -> Outcome:
             if outcome.landed_s is None and scene.count_in_air() <= (1 if name == "pilot" else 0):
                 outcome.landed_s = now_s
             fleet = scene.processes["fleet"]
+            if end_s is not None:
+                outcome.away_m = float(np.linalg.norm(scene.positions_m[:, :2] - targets_m, axis=1).max())
             if end_s is not None and now_s > end_s and name != "fleet-stopped" and fleet.poll() is None:
                 fleet.send_signal(signal.SIGINT)
                 end_s = None
@@ -267,7 +325,7 @@ def attack(name: str, folder: Path) -> Outcome:
                 break
         outcome.closest_m = closest_m if np.isfinite(closest_m) else None
         outcome.in_air, outcome.fleet_code = scene.count_in_air(), scene.processes["fleet"].poll()
-    outcome.collisions = scene.collisions
+    outcome.collisions, outcome.missed_ticks = scene.collisions, count_missed_ticks(folder / "flights")
     return outcome
 
 
@@ -276,6 +334,7 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--attack", nargs="+", choices=tuple(ATTACKS), default=list(ATTACKS))
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--vehicles", type=int, choices=tuple(FIRST_START_M), default=4)
     parser.add_argument("--out", type=Path, help="folder of the recordings, which are not kept without it")
     parser.add_argument("--json", action="store_true", help="print each attack as a line of JSON")
     options = parser.parse_args(arguments)
@@ -289,7 +348,7 @@ def main(arguments: list[str]) -> int:
         for number in range(options.rounds):
             for name in options.attack:
                 folder = (options.out or Path(short)).resolve() / f"{name}-{number}"
-                outcome = attack(name, folder)
+                outcome = attack(name, folder, options.vehicles)
                 most_in_air = 1 if name == "pilot" else 0
                 has_failed = has_failed or outcome.collisions > 0 or outcome.in_air > most_in_air
                 has_failed = has_failed or outcome.attacked_s is None
