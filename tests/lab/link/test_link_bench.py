@@ -29,8 +29,16 @@ OFFSET_NS = 123_456 * S  # of the answering computer's clock
 BURSTS: dict[str, Any] = {"model": "gilbert-elliott", "burst_enter": 0.05, "burst_leave": 0.25}
 
 
-def measure(there: LinkConfig, back: LinkConfig, count: int = COUNT) -> LinkProbe:
-    """Measure both ways of a channel in virtual time, in steps of half a millisecond."""
+def measure(there: LinkConfig, back: LinkConfig, count: int = COUNT, drift: float = 0.0) -> LinkProbe:
+    """Measure both ways of a channel in virtual time, in steps of half a millisecond.
+
+    Args:
+        drift: Drift of the answering computer's clock [s/s].
+    """
+
+    def read_far_clock(at_ns: int) -> int:
+        return at_ns + OFFSET_NS + round(drift * at_ns)
+
     seeds = np.random.SeedSequence(5).spawn(2)
     ways = Channel(there, seeds[0], 0), Channel(back, seeds[1], 0)
     probe, answer = LinkProbe(77, count, PERIOD_NS, 0), LinkAnswer()
@@ -39,9 +47,9 @@ def measure(there: LinkConfig, back: LinkConfig, count: int = COUNT) -> LinkProb
         for datagram in probe.poll(now_ns):
             ways[0].push(now_ns, datagram)
         for at_ns, data in ways[0].pop_due(now_ns):
-            for reply in answer.receive(data, at_ns + OFFSET_NS) or ():
+            for reply in answer.receive(data, read_far_clock(at_ns)) or ():
                 ways[1].push(now_ns, reply)
-        for datagram in answer.poll(now_ns + OFFSET_NS):
+        for datagram in answer.poll(read_far_clock(now_ns)):
             ways[1].push(now_ns, datagram)
         for at_ns, data in ways[1].pop_due(now_ns):
             probe.receive(data, at_ns)
@@ -84,6 +92,19 @@ def test_delays_are_those_of_the_channel_and_the_clocks_may_differ(measured: Lin
         assert abs(fit.jitter_s - 0.99 * jitter_s) < 0.002
     assert measured.round_trips_s.min() >= 0.008
     assert measured.round_trips_s.max() <= 0.026 + 0.001
+
+
+@pytest.mark.parametrize("drift", [-2e-4, 0.0, 2e-4])
+def test_a_drift_of_the_clocks_is_no_jitter(drift: float) -> None:
+    """In 30 s the clocks drift apart by 6 ms, three times the jitter."""
+    ways = LinkConfig(loss=0.1, delay_s=0.004, jitter_s=0.002), LinkConfig(delay_s=0.004, jitter_s=0.001)
+    measurement = measure(*ways, count=3000, drift=drift).measure()
+    assert abs(measurement.clock_drift - drift) < 5e-6
+    assert abs(measurement.clock_offset_s - OFFSET_NS / S) < 0.0002
+    for way, jitter_s in ((measurement.there, 0.002), (measurement.back, 0.001)):
+        fit = fit_way(way)
+        assert abs(fit.delay_s - 0.004) < 0.0002
+        assert abs(fit.jitter_s - 0.99 * jitter_s) < 0.0003
 
 
 def test_a_silent_other_side_ends_in_an_error_that_names_the_command() -> None:

@@ -2,8 +2,9 @@
 
 1. The measuring side sends numbered probes at a fixed rate. From the first one on, the answering side sends as many
    back. Each side counts the losses of the other's, so each way is measured by itself.
-2. An answer holds the times of the newest probe: sent, received. These round trips give the offset of the clocks.
+2. An answer holds the times of the newest probe: sent, received. They give the round trips.
 3. At the end the measuring side asks for the times of arrival of its probes, again and again until it has them.
+4. The lower envelopes of both ways give offset and drift of the clocks, see `fit_clock`.
 
 Probes have the size of a position in a signed frame of MAVLink 2. The answering side sends nothing after a second
 without a probe.
@@ -16,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from uavctl.arrays import SECOND_NS, Array
 from uavctl.config.link import MAX_TRACE_PACKETS
@@ -25,6 +27,7 @@ MIN_PERIOD_NS = SECOND_NS // 1000
 MIN_ARRIVALS = 50  # of either way; fewer say nothing of losses
 WAIT_NS = SECOND_NS  # for the last probes; a later one counts as lost
 REPORT_LIMIT_NS = 30 * SECOND_NS
+_MAX_DRIFT = 5e-4  # of the clocks [s/s]: quartz has 1e-4 at most, and NTP adds no more than 5e-4
 _SILENCE_NS = SECOND_NS  # from the last probe to the end of the answers
 _ASK_PERIOD_NS = SECOND_NS // 20
 _SIZE = 145  # bytes of a datagram
@@ -54,7 +57,8 @@ class LinkMeasurement:
     there: WayMeasurement  # from the measuring side
     back: WayMeasurement
     round_trips_s: Array  # (m,), without the time at the other side
-    clock_offset_s: float  # of the answering side's clock, as if the shortest round trip took as long on either way
+    clock_offset_s: float  # of the answering side's clock at the first packet, as if the shortest delays were equal
+    clock_drift: float  # of that offset [s/s]
 
 
 class LinkProbe:
@@ -143,33 +147,76 @@ class LinkProbe:
                 f"{counts[1]} packets arrived there and {counts[0]} here, of {self._count}; at least {MIN_ARRIVALS} "
                 "are needed: measure longer with --seconds"
             )
-        # θ = ((t₂ − t₁) + (t₃ − t₄)) / 2 of the shortest round trip (t₄ − t₁) − (t₃ − t₂)
-        t1, t2, t3, t4 = np.array(self._trips, dtype=np.int64).T
-        round_trips_ns = (t4 - t1) - (t3 - t2)
-        shortest = int(round_trips_ns.argmin())
-        offset_ns = int((t2 - t1)[shortest] + (t3 - t4)[shortest]) // 2
+        sent_ns = np.array(self._sent_ns, dtype=np.int64)
+        arrived_ns = np.array(received_ns, dtype=np.int64)
+        is_there = arrived_ns != _LOST_NS
+        begin_ns = self._sent_ns[0]
+        answered_ns, heard_ns = np.array(list(self._answers.values()), dtype=np.int64).T
+        offset_s, drift = fit_clock(
+            1e-9 * (sent_ns - begin_ns)[is_there],
+            1e-9 * (arrived_ns - sent_ns)[is_there],
+            1e-9 * (heard_ns - begin_ns),
+            1e-9 * (heard_ns - answered_ns),
+        )
+
+        def get_offset_ns(at_ns: int) -> int:
+            return round(1e9 * (offset_s + drift * 1e-9 * (at_ns - begin_ns)))
+
         there = [
-            (sent_ns, None if time_ns == _LOST_NS else time_ns - offset_ns)
-            for sent_ns, time_ns in zip(self._sent_ns, received_ns, strict=True)
+            (at_ns, None if time_ns == _LOST_NS else time_ns - get_offset_ns(at_ns))
+            for at_ns, time_ns in zip(self._sent_ns, received_ns, strict=True)
         ]
         # A lost answer was sent at about its turn.
         first = min(self._answers)
         base_ns = self._answers[first][0] - first * self._period_ns
         back = [
-            (self._answers[number][0], self._answers[number][1] + offset_ns)
+            (self._answers[number][0], self._answers[number][1] + get_offset_ns(self._answers[number][1]))
             if number in self._answers
             else (base_ns + number * self._period_ns, None)
             for number in range(self._count)
         ]
+        t1, t2, t3, t4 = np.array(self._trips, dtype=np.int64).T
         return LinkMeasurement(
             there=_make_way(there),
             back=_make_way(back),
-            round_trips_s=1e-9 * round_trips_ns,
-            clock_offset_s=1e-9 * offset_ns,
+            round_trips_s=1e-9 * ((t4 - t1) - (t3 - t2)),
+            clock_offset_s=offset_s,
+            clock_drift=drift,
         )
 
     def _pack(self, kind: int, body: bytes) -> bytes:
         return pack_datagram(kind, self._session, body)
+
+
+def fit_clock(there_at_s: Array, there_s: Array, back_at_s: Array, back_s: Array) -> tuple[float, float]:
+    """Fit offset θ [s] and drift δ [s/s] of the answering side's clock to the lower envelopes of both ways.
+
+    No delay is shorter than the link's, d, which is taken to be the same both ways. On a clock that drifts, the
+    shortest differences of the clocks' times lie on d + θ + δ t on the way there, and on d − θ − δ t on the way back.
+    δ is where both lines below all differences are nearest to them in the mean.
+
+    Args:
+        there_at_s: Times of sending (n,) on the measuring side.
+        there_s: Times of arrival there less those of sending (n,).
+        back_at_s: Times of arrival (m,) on the measuring side.
+        back_s: Times of arrival less those of sending there (m,).
+    """
+    # Large offsets have few digits left for delays.
+    there_base_s, back_base_s = there_s.min(), back_s.min()
+    there, back = there_s - there_base_s, back_s - back_base_s
+
+    def compute_distance(drift: float) -> float:
+        levels = there - drift * there_at_s, back + drift * back_at_s
+        return float(sum(level.mean() - level.min() for level in levels))
+
+    found = minimize_scalar(
+        compute_distance, bounds=(-_MAX_DRIFT, _MAX_DRIFT), method="bounded", options={"xatol": 1e-8}
+    )
+    drift = float(found.x)
+    # d + θ = min(t₂ − t₁ − δ t),   d − θ = min(t₄ − t₃ + δ t)
+    plus_s = there_base_s + (there - drift * there_at_s).min()
+    minus_s = back_base_s + (back + drift * back_at_s).min()
+    return float(plus_s - minus_s) / 2.0, drift
 
 
 class LinkAnswer:
