@@ -138,9 +138,9 @@ def test_vehicles_in_cells_share_one_room(tmp_path: Path, capsys: pytest.Capture
     assert fleet.cells.room_lower_m == pytest.approx([-3.0, -2.5, -2.5])
     assert run(["fleet", "check", str(path), "--json"]) == 0
     cells = json.loads(capsys.readouterr().out)["cells"]
-    assert (cells["distance_m"], cells["vertical_distance_m"]) == (0.5, 1.5)
+    assert cells["distance_m"] == 0.5
     assert run(["fleet", "check", str(path)]) == 0
-    assert "1.5 m, for the downwash" in capsys.readouterr().out
+    assert "0.5 m; height does not count" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from uavctl.arrays import Array
 from uavctl.fleet.boxes import ROUNDING_M, Boxes, divide_pairs, find_gaps
 
 DISTANCE_M = 0.5
-NEEDED_M = (0.5, 0.5, 1.5)
+LEVEL = (0, 1)
 
 
 def draw_boxes(rng: np.random.Generator, vehicles: int, stages: int) -> tuple[Boxes, Boxes]:
@@ -31,23 +31,23 @@ def divide_slowly(claims: Boxes, plans: Boxes) -> tuple[Array, Array, list[bool]
             for s in range(stages):
                 best = None
                 for low, high in ((i, j), (j, i)):
-                    for axis, needed in enumerate(NEEDED_M):
-                        if claims.lower_m[high, s, axis] - claims.upper_m[low, s, axis] < needed:
+                    for axis in LEVEL:
+                        if claims.lower_m[high, s, axis] - claims.upper_m[low, s, axis] < DISTANCE_M:
                             continue
                         width = sum((plans.upper_m[v, s, axis] - plans.lower_m[v, s, axis]) / 2 for v in (low, high))
                         means = [(plans.upper_m[v, s, axis] + plans.lower_m[v, s, axis]) / 2 for v in (low, high)]
-                        ratio = (means[1] - means[0]) / (width + needed)
+                        ratio = (means[1] - means[0]) / (width + DISTANCE_M)
                         if best is None or ratio > best[0]:
-                            best = ratio, low, high, axis, needed
+                            best = ratio, low, high, axis
                 if best is None:
                     divided[i] = divided[j] = False
                     continue
-                _, low, high, axis, needed = best
+                _, low, high, axis = best
                 plane = (plans.upper_m[low, s, axis] + plans.lower_m[high, s, axis]) / 2
-                plane = max(plane, claims.upper_m[low, s, axis] + needed / 2)
-                plane = min(plane, claims.lower_m[high, s, axis] - needed / 2)
-                upper[low, s, axis] = min(upper[low, s, axis], plane - needed / 2)
-                lower[high, s, axis] = max(lower[high, s, axis], plane + needed / 2)
+                plane = max(plane, claims.upper_m[low, s, axis] + DISTANCE_M / 2)
+                plane = min(plane, claims.lower_m[high, s, axis] - DISTANCE_M / 2)
+                upper[low, s, axis] = min(upper[low, s, axis], plane - DISTANCE_M / 2)
+                lower[high, s, axis] = max(lower[high, s, axis], plane + DISTANCE_M / 2)
     return lower, upper, divided
 
 
@@ -81,6 +81,15 @@ def test_a_vehicle_without_a_claim_is_not_divided_from_others() -> None:
     bounds = divide_pairs(alone, plans, DISTANCE_M)
     assert np.isinf(bounds.lower_m).all()
     assert np.isinf(bounds.upper_m).all()
+
+
+def test_boxes_above_each_other_are_not_apart() -> None:
+    """Their vehicles would meet on the floor where both land, however far apart in height they are."""
+    claims = Boxes(
+        np.array([[[0.0, 0.0, -9.0]], [[0.0, 0.0, -1.0]]]), np.array([[[1.0, 1.0, -8.0]], [[1.0, 1.0, 0.0]]])
+    )
+    assert find_gaps(claims, claims, DISTANCE_M).max() < 1.0
+    assert not divide_pairs(claims, claims, DISTANCE_M).is_divided.any()
 
 
 def test_two_claims_too_near_are_not_divided() -> None:

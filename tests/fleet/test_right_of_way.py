@@ -80,9 +80,15 @@ def test_two_face_to_face_both_pass_on_the_right() -> None:
 
 
 def test_a_free_way_leads_to_the_goal() -> None:
-    positions_m = np.array([[0.0, 0.0, -1.0], [-0.6, 0.0, -1.0], [LOOK_AHEAD_M + 0.1, 0.0, -1.0], [0.6, 0.0, -2.6]])
-    goals_m = np.array([[2.9, 0.0, -1.0], [-0.6, 0.0, -1.0], [2.0, 0.0, -1.0], [0.6, 0.0, -2.6]])
+    positions_m = np.array([[0.0, 0.0, -1.0], [-0.6, 0.0, -1.0], [LOOK_AHEAD_M + 0.1, 0.0, -1.0]])
+    goals_m = np.array([[2.9, 0.0, -1.0], [-0.6, 0.0, -1.0], [2.0, 0.0, -1.0]])
     np.testing.assert_array_equal(choose_guides(positions_m, goals_m, WAYS)[0], goals_m[0])
+
+
+def test_a_vehicle_far_above_blocks_the_way() -> None:
+    positions_m = np.array([[0.0, 0.0, -1.0], [0.6, 0.0, -2.9]])
+    goals_m = np.array([[2.9, 0.0, -1.0], [0.6, 0.0, -2.9]])
+    np.testing.assert_array_equal(choose_guides(positions_m, goals_m, WAYS)[0, :2], [0.0, PASS_M])
 
 
 def test_a_vehicle_at_its_goal_gives_way_to_one_that_cannot_pass() -> None:

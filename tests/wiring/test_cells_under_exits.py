@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from uavctl.arrays import SECOND_NS, Array
-from uavctl.fleet.boxes import get_axis_distances_m
+from uavctl.fleet.boxes import LEVEL
 from uavctl.fleet.cell import NO_CELL, MovingCell, PlannedPath, Report, format_report, parse_cell
 from uavctl.fleet.coordinator import CellParameters
 from uavctl.flight.cells import NO_CELLS, add_cell, choose_cell, leave_cells, refuse_cell
@@ -90,13 +90,13 @@ class ExitingVehicle:
 
 
 def measure_gap(first: MovingCell, second: MovingCell, step: int) -> float:
-    """Return the least gap of two cells from a step on, over the distance of each axis."""
+    """Return the least gap of two cells from a step on, north or east, over the distance."""
     index = np.arange(STAGES)
     boxes = [np.minimum(index + step - cell.step, STAGES - 1) for cell in (first, second)]
     gaps_m = np.maximum(
         first.lower_m[boxes[0]] - second.upper_m[boxes[1]], second.lower_m[boxes[1]] - first.upper_m[boxes[0]]
     )
-    return float((gaps_m / get_axis_distances_m(PARAMETERS.distance_m)).max(axis=1).min())
+    return float((gaps_m[:, LEVEL] / PARAMETERS.distance_m).max(axis=1).min())
 
 
 @pytest.mark.parametrize(("loss", "delay"), [(0.0, 1), (0.3, 4), (0.6, 15)])

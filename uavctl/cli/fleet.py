@@ -48,7 +48,6 @@ from uavctl.daemon.cell_exchange import CellExchange, ExchangedVehicle, run_exch
 from uavctl.daemon.control_socket import ControlRequest, Reply, find_control_folder, make_socket_path
 from uavctl.daemon.health import Health
 from uavctl.errors import NotReachedError, UavctlError, in_words
-from uavctl.fleet.boxes import DOWNWASH
 from uavctl.fleet.coordinator import CellParameters
 from uavctl.flight.limits import AXES
 from uavctl.operating_system import check_flight_platform
@@ -574,7 +573,6 @@ def _describe_cells(cells: CellParameters) -> dict[str, float]:
     """Describe what the distance of moving cells means; lengths in metres."""
     return {
         "distance_m": cells.distance_m,
-        "vertical_distance_m": DOWNWASH * cells.distance_m,
         "margin_m": cells.margin_m,
         "start_distance_m": cells.distance_m + 2.0 * (COLUMN_M + cells.margin_m),
         "silence_s": cells.silence_s,
@@ -589,8 +587,7 @@ def _make_room_table(fleet: Fleet, cells: CellParameters) -> Table:
             f"{axis} [m]": f"{low:g} to {high:g}"
             for axis, low, high in zip(AXES, cells.room_lower_m, cells.room_upper_m, strict=True)
         },
-        "cells apart, north or east": f"{figures['distance_m']:g} m",
-        "or in height": f"{figures['vertical_distance_m']:g} m, for the downwash",
+        "cells apart, north or east": f"{figures['distance_m']:g} m; height does not count",
         "centres apart in flight": f"more: each cell also holds its plan's margins and {figures['margin_m']:g} m",
         "centres apart at the start": f"{figures['start_distance_m']:.2f} m, north or east",
     }

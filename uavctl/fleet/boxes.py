@@ -1,8 +1,8 @@
 """Boxes in time, and separating planes between the boxes of all pairs of vehicles.
 
 1. A box of stage s contains a vehicle from step k + s to step k + s + 1; the last one holds for all later steps.
-2. Two boxes are apart if, along one axis, the gap between them is at least the distance of that axis. The distance is
-   d along north and east and `DOWNWASH` d along down: downwash reaches further below a vehicle than beside it.
+2. Two boxes are apart if the gap between them is at least d, north or east. Height does not count: the lower vehicle
+   would fly in the downwash of the upper one, and two that land above each other would meet on the floor.
 3. A pair may be divided along any axis where the boxes that both may use already (the claims) are apart. Of these the
    axis is selected where the plans are furthest apart relative to their margins. So a plane never cuts a claim.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from uavctl.arrays import Array, Flags
 
-DOWNWASH = 3.0  # vertical distance over horizontal distance: the wake of a quadrotor is narrow and long
+LEVEL = slice(0, 2)  # north and east
 ROUNDING_M = 1e-9  # a gap smaller than a distance by less than this is rounding
 
 
@@ -42,6 +42,10 @@ class Boxes:
         """Return these boxes for the vehicles with a flag (N,), else those of `other`."""
         chosen = vehicles[:, None, None]
         return Boxes(np.where(chosen, self.lower_m, other.lower_m), np.where(chosen, self.upper_m, other.upper_m))
+
+    def take_level(self) -> Boxes:
+        """Return the sides north and east alone (N, S, 2)."""
+        return Boxes(self.lower_m[..., LEVEL], self.upper_m[..., LEVEL])
 
     def cover(self, other: Boxes) -> Boxes:
         """Return the hull of these boxes and those of `other`."""
@@ -69,30 +73,25 @@ class Bounds:
     is_divided: Flags  # whether a plane divides the vehicle from each other one, in all stages (N,)
 
 
-def get_axis_distances_m(distance_m: float) -> Array:
-    """Return the distance to keep along each axis (3,) [m]."""
-    return np.array([distance_m, distance_m, DOWNWASH * distance_m])
-
-
 def divide_pairs(claims: Boxes, plans: Boxes, distance_m: float) -> Bounds:
-    """Divide each pair of vehicles by one plane normal to an axis in each stage, and return the sides of the planes.
+    """Divide each pair by one plane in each stage, normal to north or east, and return the sides of the planes.
 
     Args:
         claims: Boxes that the vehicles may use already. A plane is outside of them by half of the distance. An empty
             claim needs no plane.
         plans: Mean plans with their margins, inside of the claims.
-        distance_m: Horizontal distance that the pairs keep.
+        distance_m: Distance d that the pairs keep, north or east.
     """
-    needed = get_axis_distances_m(distance_m)
     first, second = np.triu_indices(len(claims.lower_m), 1)
     present = ~claims.is_empty
     is_pair = present[first] & present[second]
     first, second = first[is_pair], second[is_pair]
+    plans, level_claims = plans.take_level(), claims.take_level()
     middle, half = 0.5 * (plans.lower_m + plans.upper_m), 0.5 * (plans.upper_m - plans.lower_m)
     # ρ = ±(m_j - m_i) / (w_i + w_j + d), + where the claim of i is below that of j: at most one sign is possible
-    ratio = (middle[second] - middle[first]) / (half[first] + half[second] + needed)
-    is_below = claims.lower_m[second] - claims.upper_m[first] >= needed - ROUNDING_M
-    is_above = claims.lower_m[first] - claims.upper_m[second] >= needed - ROUNDING_M
+    ratio = (middle[second] - middle[first]) / (half[first] + half[second] + distance_m)
+    is_below = level_claims.lower_m[second] - level_claims.upper_m[first] >= distance_m - ROUNDING_M
+    is_above = level_claims.lower_m[first] - level_claims.upper_m[second] >= distance_m - ROUNDING_M
     ratio = np.where(is_below, ratio, np.where(is_above, -ratio, -np.inf))
     choice = ratio.argmax(axis=2)
     is_apart = np.isfinite(np.take_along_axis(ratio, choice[..., None], axis=2)[..., 0])
@@ -102,7 +101,7 @@ def divide_pairs(claims: Boxes, plans: Boxes, distance_m: float) -> Bounds:
     low, high = np.where(is_above, second[pair], first[pair]), np.where(is_above, first[pair], second[pair])
     low_at, high_at = (low, stage, axis), (high, stage, axis)
     # c = (p_low + p_high) / 2, at least d / 2 outside of both claims
-    half_needed = 0.5 * needed[axis]
+    half_needed = 0.5 * distance_m
     least_m, most_m = claims.upper_m[low_at] + half_needed, claims.lower_m[high_at] - half_needed
     middle_m = 0.5 * (plans.upper_m[low_at] + plans.lower_m[high_at])
     centre_m = np.where(least_m > most_m, 0.5 * (least_m + most_m), np.clip(middle_m, least_m, most_m))
@@ -116,7 +115,8 @@ def divide_pairs(claims: Boxes, plans: Boxes, distance_m: float) -> Bounds:
 
 
 def find_gaps(first: Boxes, second: Boxes, distance_m: float) -> Array:
-    """Return the largest gap over its distance along any axis, (N, M, S), of all pairs of boxes; apart: at least 1."""
+    """Return the larger gap, north or east, over the distance, (N, M, S), of all pairs of boxes; apart: at least 1."""
+    first, second = first.take_level(), second.take_level()
     ahead_m = second.lower_m[None] - first.upper_m[:, None]
     behind_m = first.lower_m[:, None] - second.upper_m[None]
-    return np.asarray((np.maximum(ahead_m, behind_m) / get_axis_distances_m(distance_m)).max(axis=3))
+    return np.asarray(np.maximum(ahead_m, behind_m).max(axis=3) / distance_m)

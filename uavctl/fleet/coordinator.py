@@ -25,7 +25,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from uavctl.arrays import Array, Flags
-from uavctl.fleet.boxes import ROUNDING_M, Bounds, Boxes, divide_pairs, find_gaps, get_axis_distances_m
+from uavctl.fleet.boxes import LEVEL, ROUNDING_M, Bounds, Boxes, divide_pairs, find_gaps
 from uavctl.fleet.cell import NO_CELL, MovingCell, PlannedPath, Report
 from uavctl.fleet.obstacles import find_reach
 from uavctl.fleet.priority import Progress, choose_places, follow_progress, make_grid
@@ -46,7 +46,7 @@ MIN_SPEED_MPS, MIN_WAY_M = 0.1, 0.01  # an obstacle that is slower stands; a veh
 class CellParameters:
     """Constants of the cells."""
 
-    distance_m: float  # horizontal distance that all pairs keep
+    distance_m: float  # that all pairs keep, north or east
     room_lower_m: Array  # (3,), local NED
     room_upper_m: Array  # (3,)
     accel_mps2: Array  # largest acceleration of each axis (3,)
@@ -413,18 +413,17 @@ def _avoid_obstacles(
     state: CoordinatorState, is_growing: Flags, is_blocked: Flags, plans: Boxes, parameters: CellParameters
 ) -> tuple[Bounds, Flags]:
     """Return the sides of the planes beside obstacles, and whether a vehicle's plan may meet one (N,)."""
-    needed = get_axis_distances_m(parameters.distance_m)
     lower_m, upper_m = np.full(plans.lower_m.shape, -np.inf), np.full(plans.upper_m.shape, np.inf)
     must_land = np.zeros(len(is_growing), dtype=bool)
     for i in np.flatnonzero(is_growing | is_blocked):
         box = _find_reach_boxes(state, i, parameters) if is_growing[i] else (plans.lower_m[i], plans.upper_m[i])
-        low_m, high_m = box[0] - needed, box[1] + needed
-        gap = np.concatenate([low_m - plans.upper_m, plans.lower_m - high_m], axis=2) / np.tile(needed, 2)
+        low_m, high_m = box[0] - parameters.distance_m, box[1] + parameters.distance_m
+        gap = np.concatenate([(low_m - plans.upper_m)[..., LEVEL], (plans.lower_m - high_m)[..., LEVEL]], axis=2)
         choice = gap.argmax(axis=2)
         if is_growing[i]:
             must_land |= (gap.max(axis=2) < 0.0).any(axis=1) & (np.arange(len(must_land)) != i)
         vehicle, stage = np.nonzero(np.ones(choice.shape, dtype=bool))
-        axis, is_below = choice.ravel() % 3, choice.ravel() < 3
+        axis, is_below = choice.ravel() % 2, choice.ravel() < 2
         at = vehicle, stage, axis
         np.minimum.at(upper_m, at, np.where(is_below, low_m[stage, axis], np.inf))
         np.maximum.at(lower_m, at, np.where(is_below, -np.inf, high_m[stage, axis]))

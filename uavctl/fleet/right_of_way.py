@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 
 from uavctl.arrays import Array, Flags
-from uavctl.fleet.boxes import DOWNWASH, ROUNDING_M
+from uavctl.fleet.boxes import LEVEL, ROUNDING_M
 
 
 class Move(Enum):
@@ -42,14 +42,13 @@ def choose_move(is_free: dict[Move, bool], has_right_of_way: bool) -> Move:
 LOOK_AHEAD_M = 1.6  # way on which a vehicle looks for others: about that of a stop from 1.5 m/s, twice
 PASS_M = 1.2  # way of a move to a side
 ARRIVED_M = 0.15  # a vehicle that is this near to its goal rests
-LEVEL = slice(0, 2)  # north and east
 
 
 @dataclass(frozen=True, eq=False)
 class Ways:
     """Room and width of the ways of the vehicles."""
 
-    distance_m: float  # horizontal distance of the pairs
+    distance_m: float  # that the pairs keep, north or east
     margin_m: float  # room around a plan
     room_lower_m: Array  # (3,)
     room_upper_m: Array  # (3,)
@@ -72,8 +71,7 @@ def choose_guides(positions_m: Array, goals_m: Array, ways: Ways) -> Array:
     length_m = np.linalg.norm(way_m, axis=1)
     ahead = way_m / np.maximum(length_m, ARRIVED_M)[:, None]
     offsets_m = (positions_m[None] - positions_m[:, None])[..., LEVEL]
-    is_other = np.abs(positions_m[None, :, 2] - positions_m[:, None, 2]) < DOWNWASH * ways.distance_m
-    np.fill_diagonal(is_other, False)
+    is_other = ~np.eye(len(positions_m), dtype=bool)
     look_m = np.minimum(LOOK_AHEAD_M, length_m + ways.width_m)[:, None]
     is_blocking = is_other & _is_on_way(*_project(offsets_m, ahead), look_m, ways.width_m)
     blockers = np.where(is_blocking, np.linalg.norm(offsets_m, axis=2), np.inf).argmin(axis=1)

@@ -21,7 +21,6 @@ import numpy as np
 
 from uavctl.arrays import SECOND_NS, Array
 from uavctl.config import load_config
-from uavctl.fleet.boxes import DOWNWASH
 from uavctl.fleet.cell import Report, format_cell, parse_report
 from uavctl.fleet.coordinator import CellParameters, lead
 from uavctl.fleet.priority import Progress
@@ -82,7 +81,7 @@ class SwapResult:
     arrived: int
     finish_s: float  # when the last one arrived for good; NaN if one did not
     straight_s: float  # time of the longest way, alone and without disturbance
-    closest: float  # least distance of a pair over the stated one: horizontal, or vertical over `DOWNWASH`
+    closest: float  # least horizontal distance of a pair over the stated one
     near_share: float  # share of the truths of a pair below the stated distance
     outside_share: float  # share of the truths of a vehicle with a cell that are outside of it
     collisions: int
@@ -174,11 +173,10 @@ def _take_due(queue: list[tuple[int, int, Message]], at_ns: int) -> list[tuple[i
 
 
 def measure_distances(positions_m: Array, distance_m: float) -> Array:
-    """Return the distance of each pair over the stated one: (pairs,)."""
+    """Return the horizontal distance of each pair over the stated one: (pairs,)."""
     pairs = np.array(list(combinations(range(len(positions_m)), 2)), dtype=int).reshape(-1, 2)
     offsets_m = positions_m[pairs[:, 0]] - positions_m[pairs[:, 1]]
-    level_m, vertical_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1]), np.abs(offsets_m[:, 2])
-    return np.asarray(np.maximum(level_m, vertical_m / DOWNWASH) / distance_m)
+    return np.asarray(np.hypot(offsets_m[:, 0], offsets_m[:, 1]) / distance_m)
 
 
 class Swap:
