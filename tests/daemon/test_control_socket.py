@@ -478,6 +478,23 @@ def test_a_cell_of_the_longest_horizon_reaches_the_flight_and_its_report_comes_b
     assert json.loads(client.recv(65_536))["ok"] and len(rig.flight.cells) == 1 and rig.permits == 1
 
 
+def test_cells_and_permits_come_from_one_connection_until_it_closes(rig: Rig) -> None:
+    """Two coordinators count their cells alike: each would take those of the other one for its own."""
+    (first,) = rig.say(ask(ask="cell", cell=make_cell()))
+    rig.ticks()
+    assert heard(first)["ok"]
+    (second,) = rig.say(ask(ask="cell", cell=make_cell(number=4), may_take_off=True))
+    rig.ticks()
+    reply = heard(second)
+    assert not reply["ok"] and reply["report"] is None and "another coordinator" in reply["text"]
+    assert len(rig.flight.cells) == 1 and rig.permits == 0
+    first.close()
+    second.sendall(ask(ask="cell", cell=make_cell(number=4), may_take_off=True))
+    rig.ticks()
+    second.setblocking(True)
+    assert json.loads(second.recv(65_536))["ok"] and len(rig.flight.cells) == 2 and rig.permits == 1
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -246,6 +246,18 @@ def test_vehicles_with_cells_of_another_coordinator_are_refused() -> None:
         begin_without_cells(0, reports, PARAMETERS)
 
 
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_cell_in_use_that_was_never_issued_is_an_error(number: int) -> None:
+    """Where it is unknown, its vehicle could be anywhere: no claim of the others would be right."""
+    state = begin(0, STARTS_M[:2], STARTS_M[1::-1].copy(), PARAMETERS)
+    state = issue(state, PARAMETERS)
+    known, foreign = state.newest[number].number, state.newest[number].number + 1
+    taken = dataclasses.replace(state.reports[number], in_use=known, decided=known)
+    assert receive(state, {number: taken}).used_numbers[number] == known
+    with pytest.raises(ValueError, match="another coordinator"):
+        receive(state, {number: dataclasses.replace(taken, in_use=foreign, decided=foreign)})
+
+
 def test_cells_leave_more_room_for_a_vehicle_that_refuses_them_until_it_takes_one() -> None:
     place_m = np.array([0.0, 0.0, -1.5])
     path = PlannedPath(0, np.tile(place_m, (STAGES, 1)), np.full((STAGES, 3), 2.0))

@@ -185,6 +185,7 @@ class ControlServer:
         self._pending: list[tuple[_Client, Command]] = []  # for the next tick's answers
         self._take_off_checker = take_off_checker
         self._checked: tuple[_Client, Command] | None = None  # a take-off, while its check runs
+        self._coordinator: _Client | None = None  # the first one that asks for cells, while it is connected
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """Answer the orders of the tick, then read new requests; bounded work, no waiting."""
@@ -285,7 +286,7 @@ class ControlServer:
             self._reply(client, Reply(ok=True, text="", status=self._make_health()))
             return
         if request.ask == "cell":
-            self._reply(client, self._exchange_cell(request))
+            self._reply(client, self._exchange_cell(client, request))
             return
         problem = (
             request.find_problem()
@@ -317,9 +318,16 @@ class ControlServer:
         else:
             self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
 
-    def _exchange_cell(self, request: ControlRequest) -> CellReply:
-        """Put the cell of the coordinator, and return the report for it."""
+    def _exchange_cell(self, client: _Client, request: ControlRequest) -> CellReply:
+        """Put the cell of the coordinator, and return the report for it.
+
+        Cells of two coordinators have the same numbers, so that neither would know which one is in use.
+        """
+        if self._coordinator not in self._clients:
+            self._coordinator = client
         problem = request.find_problem() or ""
+        if self._coordinator is not client:
+            problem = "another coordinator sends cells to this vehicle: end one of the two fleets"
         if not problem and request.cell is not None:
             problem = self._order_receiver.put_cell(request.cell)
         if problem:

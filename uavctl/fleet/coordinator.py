@@ -149,9 +149,7 @@ def begin_without_cells(step: int, reports: Sequence[Report], parameters: CellPa
     """
     for number, report in enumerate(reports):
         if report.in_use != NO_CELL:
-            raise ValueError(
-                f"vehicle {number} uses a cell of another coordinator: land it, then start the fleet again"
-            )
+            raise _make_foreign_cell_error(number)
     count, stages = len(reports), parameters.stages
     positions_m = [report.plan.mean_m[0] for report in reports]
     cells = [
@@ -179,6 +177,10 @@ def begin_without_cells(step: int, reports: Sequence[Report], parameters: CellPa
     return replace(state, goals_m=_take_goals(state))
 
 
+def _make_foreign_cell_error(number: int) -> ValueError:
+    return ValueError(f"vehicle {number} uses a cell of another coordinator: land it, then start the fleet again")
+
+
 def find_near_starts(reports: Sequence[Report], parameters: CellParameters) -> list[tuple[int, int, float]]:
     """Find the pairs whose places with their margins are nearer than the distance, and the distance to place them at.
 
@@ -203,7 +205,11 @@ def advance(state: CoordinatorState, step: int) -> CoordinatorState:
 
 
 def receive(state: CoordinatorState, reports: Mapping[int, Report]) -> CoordinatorState:
-    """Take up reports by the number of the vehicle; older ones than the newest known change nothing."""
+    """Take up reports by the number of the vehicle; older ones than the newest known change nothing.
+
+    Raises:
+        ValueError: A vehicle uses a cell that was not issued to it, whose sides nobody here knows.
+    """
     newest, numbers, in_use, exits = list(state.reports), list(state.used_numbers), list(state.newest), [*state.exits]
     is_taken, is_decided, has_left = (np.zeros(len(newest), dtype=bool) for _ in range(3))
     for i, report in reports.items():
@@ -215,6 +221,8 @@ def receive(state: CoordinatorState, reports: Mapping[int, Report]) -> Coordinat
         for cell in (state.previous[i], state.newest[i]):
             if report.in_use == cell.number != numbers[i] and report.exits == cell.exits:
                 is_taken[i], in_use[i], numbers[i] = True, cell, cell.number
+        if report.in_use not in (NO_CELL, numbers[i], state.previous[i].number, state.newest[i].number):
+            raise _make_foreign_cell_error(i)
         is_decided[i] = report.decided >= state.newest[i].number and report.in_use == numbers[i]
     empty = Boxes.make_empty(*state.used.lower_m.shape[:2])
     pending = empty.take(is_decided | has_left, state.pending)
