@@ -103,6 +103,80 @@ def test_speeds_are_checked_at_their_extremes(tmp_path: Path) -> None:
     assert reason.startswith("2: mission.trajectory.velocities_mps[")
 
 
+def round_six(coefficients: Sequence[float]) -> list[float]:
+    return [round(coefficient, 6) for coefficient in coefficients]
+
+
+def sum_rounding(duration_s: float) -> float:
+    """The most by which coefficients that are rounded to six decimals move the end of a piece [m]."""
+    return float(0.5e-6 * Polynomial([1.0] * 8)(duration_s))
+
+
+@pytest.mark.parametrize("duration_s", [3.0, 6.0, 8.0])
+def test_long_pieces_of_six_decimals_meet(tmp_path: Path, duration_s: float) -> None:
+    exact = scale(STEP, 2.0, duration_s)
+    back = scale(STEP, -2.0, duration_s)
+    back[0] = 2.0
+    ways = [round_six(way) for way in (exact, back)]
+    # What rounding alone moves the end by is seen, and the motion stays that of the file within it.
+    found = spline(read(tmp_path, HEADER, *(row(duration_s, way) for way in ways)))
+    times_s: NDArray[np.float64] = np.linspace(0.0, 2.0 * duration_s, 20_001)
+    wanted = np.where(
+        times_s < duration_s, Polynomial(exact)(times_s), Polynomial(back)(np.maximum(times_s - duration_s, 0.0))
+    )
+    found_m = found(times_s)[:, 1]
+    assert abs(found_m - wanted).max() <= 2.0 * sum_rounding(duration_s) + 1e-4
+    fastest_mps = abs(Polynomial(exact).deriv()(times_s[times_s <= duration_s])).max()
+    slack_mps = 2.0 * 0.5e-6 * Polynomial([1.0] * 8).deriv()(duration_s)
+    steps_m = abs(np.diff(found_m)).max()
+    assert steps_m <= 1.05 * (fastest_mps + slack_mps) * times_s[1]  # no jump where pieces meet
+
+
+@pytest.mark.parametrize("duration_s", [1.0, 6.0, 8.0])
+@pytest.mark.parametrize(("share", "is_refused"), [(0.99, False), (1.01, True)])
+def test_jumps_up_to_the_rounding_are_taken_off_and_larger_ones_are_refused(
+    tmp_path: Path, duration_s: float, share: float, is_refused: bool
+) -> None:
+    # Not counted: the six decimals of the next piece's own begin
+    jump_m = share * max(0.02, sum_rounding(duration_s) + 0.5e-6)
+    lines = HEADER, row(duration_s, REST), row(2.0, (jump_m, *REST[1:]))
+    if is_refused:
+        assert reasons(tmp_path, *lines)[0].startswith("3: column 2, x^0: begins")
+    else:
+        found = spline(read(tmp_path, *lines))
+        assert found(duration_s)[1] == pytest.approx(jump_m, abs=1e-12) and found(0.0)[1] == 0.0
+        times_s = np.linspace(0.0, duration_s + 2.0, 10_001)
+        assert abs(np.diff(found(times_s)[:, 1])).max() < 10.0 * jump_m / duration_s * times_s[1]
+
+
+@pytest.mark.parametrize("before_end_s", [0.0, 1e-9, 4e-7, 1e-6, 2e-6, 1e-4, 0.01])
+@pytest.mark.parametrize("jump_m", [0.0, 0.015])
+def test_an_extreme_near_an_inner_end_counts_once_and_is_never_missed(
+    tmp_path: Path, before_end_s: float, jump_m: float
+) -> None:
+    """x rises to its extreme shortly before the end of the first piece; the second one goes back to rest."""
+    end_s, height_m = 4.0, 1.0
+    top_s = end_s - before_end_s
+    rise = Polynomial([0.0, 2.0 * height_m / top_s, -height_m / top_s**2])
+    begin_m, begin_mps = float(rise(end_s)) - jump_m, float(rise.deriv()(end_s))
+    back = Polynomial([begin_m, begin_mps, -0.05])
+    rows = [row(end_s, [*rise.coef.tolist(), *REST[3:]]), row(2.0, [*back.coef.tolist(), *REST[3:]])]
+    trajectory = read(tmp_path, HEADER, *rows)
+    times_s, east_m = np.array(trajectory.times_s), np.array(trajectory.positions_m)[:, 1]
+    # The joint is at the begin of the second piece; a small jump bends the end of the first one.
+    a = -jump_m * 7.0 / end_s**6
+    b = jump_m * 6.0 / end_s**7
+    flown = rise + Polynomial([0.0] * 6 + [a, b])
+    dense: NDArray[np.float64] = np.concatenate(
+        [np.linspace(0.0, end_s, 40_001), np.linspace(end_s - 0.05, end_s, 50_001)]
+    )
+    largest_m = max(flown(dense).max(), back(np.linspace(0.0, 2.0, 10_001)).max())
+    assert east_m.max() == pytest.approx(largest_m, abs=1e-10)
+    assert np.diff(times_s).min() > 0.9e-6
+    if not jump_m:
+        assert np.sum(abs(times_s - top_s) < 1.1e-6) == 1
+
+
 @pytest.mark.parametrize(
     ("lines", "told"),
     [

@@ -1,6 +1,7 @@
 """Trajectory of polynomials, as `uav_trajectories` writes it: lines of duration, x^0 … x^7, y^0 … yaw^7.
 
-The samples of a piece hold each extreme of position and velocity, so that limits are checked on the polynomial itself.
+Pieces meet as far as six decimals of their coefficients permit; the end of the earlier piece takes up the rest. The
+samples of a piece hold each extreme of position and velocity, so that limits are checked on the polynomial itself.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ _MAX_SHOWN = 40  # characters of a cell
 # A cubic between samples is no further than this from the polynomial [m].
 _SPLINE_ERROR_M = 1e-4
 _MIN_GAP_S = 1e-6  # between samples; nothing moves by more than its speed times this
-# Files have six decimals: at 4 s, the error of x^7 alone is 4^7 · 5e-7 = 8 mm, and 14 mm/s.
-_JUMP_M, _JUMP_MPS = 0.02, 0.05
+_ROUNDING = 0.5e-6  # of each coefficient: files have six decimals
+_JUMP_M, _JUMP_MPS = 0.02, 0.05  # smaller jumps are accepted for each duration
 _HALVINGS = 100
 
 
@@ -65,6 +66,7 @@ def sample_polynomials(path: Path, rows: Sequence[tuple[int, Sequence[str]]]) ->
     refuse_file(path, [f"{path}:{line}: {reason}" for line, cells in rows[1:] for reason in _find_cell_problems(cells)])
     pieces = [_make_piece(line, cells) for line, cells in rows[1:]]
     refuse_file(path, [f"{path}:{reason}" for reason in _find_jumps(pieces)])
+    pieces = [*(_join(before, piece) for before, piece in pairwise(pieces)), pieces[-1]]
     samples: list[tuple[int, Floats]] = []
     begin_s = 0.0
     for piece in pieces:
@@ -145,20 +147,51 @@ def _make_piece(line: int, cells: Sequence[str]) -> Piece:
 def _find_jumps(pieces: Sequence[Piece]) -> Iterator[str]:
     """Yield where a piece does not begin as the one before it ends."""
     for before, piece in pairwise(pieces):
+        limit_m, limit_mps = _compute_jump_limits(before.duration_s)
         for axis, old, new in zip(_AXES, before.axes, piece.axes, strict=False):
-            jump_m = abs(evaluate(new, 0.0) - evaluate(old, before.duration_s))
-            jump_mps = abs(evaluate(derive(new), 0.0) - evaluate(derive(old), before.duration_s))
+            jump_m, jump_mps = _compute_jump(old, new, before.duration_s)
             column = 1 + HEADINGS.index(f"{axis}^0")
-            if jump_m > _JUMP_M:
+            if abs(jump_m) > limit_m:
                 yield (
-                    f"{piece.line}: column {column}, {axis}^0: begins {jump_m:.3g} m from the end of line "
+                    f"{piece.line}: column {column}, {axis}^0: begins {abs(jump_m):.3g} m from the end of line "
                     f"{before.line}; let them meet"
                 )
-            elif jump_mps > _JUMP_MPS:
+            elif abs(jump_mps) > limit_mps:
                 yield (
-                    f"{piece.line}: column {column + 1}, {axis}^1: begins {jump_mps:.3g} m/s from the speed at the end "
-                    f"of line {before.line}; let speeds meet"
+                    f"{piece.line}: column {column + 1}, {axis}^1: begins {abs(jump_mps):.3g} m/s from the speed at "
+                    f"the end of line {before.line}; let speeds meet"
                 )
+
+
+def _compute_jump_limits(duration_s: float) -> tuple[float, float]:
+    """Return the largest jumps [m] and [m/s] that rounded coefficients explain at the end of a piece."""
+    # r (1 + Σ T^k) and r (1 + Σ k T^(k-1)); the coefficient of the next piece is rounded, too
+    ones = (1.0,) * (_DEGREE + 1)
+    limit_m, limit_mps = (
+        _ROUNDING * (1.0 + evaluate(coefficients, duration_s)) for coefficients in (ones, derive(ones))
+    )
+    return max(_JUMP_M, limit_m), max(_JUMP_MPS, limit_mps)
+
+
+def _compute_jump(old: Floats, new: Floats, duration_s: float) -> tuple[float, float]:
+    """Return the jump of position [m] and velocity [m/s] from the end of a piece to the begin of the next."""
+    return (
+        evaluate(new, 0.0) - evaluate(old, duration_s),
+        evaluate(derive(new), 0.0) - evaluate(derive(old), duration_s),
+    )
+
+
+def _join(before: Piece, piece: Piece) -> Piece:
+    """Return the earlier piece with an end that meets the next one; its begin stays."""
+    end_s = before.duration_s
+    axes = []
+    for old, new in zip(before.axes, piece.axes, strict=True):
+        jump_m, jump_mps = _compute_jump(old, new, end_s)
+        # a t^6 + b t^7 = Δx and 6 a t^5 + 7 b t^6 = Δv at t = T
+        sixth = (7.0 * jump_m - jump_mps * end_s) / end_s**6
+        seventh = (jump_mps * end_s - 6.0 * jump_m) / end_s**7
+        axes.append((*old[:6], old[6] + sixth, old[7] + seventh))
+    return before._replace(axes=tuple(axes))
 
 
 def _choose_times(path: Path, piece: Piece, limit: int) -> list[float]:
