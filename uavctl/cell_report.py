@@ -4,6 +4,7 @@
 2. On the ground, and in its own climb or landing, it moves along a column: up to the height of the climb that was
    ordered, or down to the floor.
 3. Braking and holding, it is free, with what may drive it. With its pilot or a failsafe, only its limits count.
+4. After its landing it does not move, also where nobody hears of it any more.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _END = (HandoverState.DONE, HandoverState.FAILED)
 
 def find_conduct(handover: HandoverState, vehicle: VehicleStatus | None, state: ControlState) -> Conduct:
     """Find how a vehicle moves."""
-    is_on_ground = vehicle is not None and (not vehicle.armed or vehicle.landed is True)
+    is_on_ground = _is_on_ground(vehicle)
     if handover in (*_CLIMB, *_LANDING):
         return Conduct.PATH
     if is_on_ground and handover in (*_BEFORE_FLIGHT, *_END):
@@ -43,6 +44,15 @@ def find_conduct(handover: HandoverState, vehicle: VehicleStatus | None, state: 
     if handover is HandoverState.ENGAGED and state.mode is ControlMode.TRACK:
         return Conduct.REST if state.cells.choice.cell is None else Conduct.CELL
     return Conduct.FREE
+
+
+def has_landed(handover: HandoverState, vehicle: VehicleStatus | None) -> bool:
+    """Whether a vehicle stands on the ground after its flight."""
+    return handover in (*_LANDING, *_END) and _is_on_ground(vehicle)
+
+
+def _is_on_ground(vehicle: VehicleStatus | None) -> bool:
+    return vehicle is not None and (not vehicle.armed or vehicle.landed is True)
 
 
 def make_report(
@@ -53,6 +63,8 @@ def make_report(
     handover: HandoverState,
     conduct: Conduct,
     climb_m: float,
+    *,
+    has_landed: bool,
 ) -> CellReport:
     """Make the report of a tick.
 
@@ -62,6 +74,7 @@ def make_report(
         handover: State of the hand-over.
         conduct: Of the vehicle, see `find_conduct`.
         climb_m: Height of the climb that was ordered [m]; 0 without one.
+        has_landed: Whether the vehicle has landed. Its daemon then ends: the last report says that it stays there.
     """
     rows, plant = controller.cell_rows, controller.plant
     assert rows is not None
@@ -78,6 +91,8 @@ def make_report(
     reach_mps2 = np.full(3, DRIFT_MPS2)
     if handover is not HandoverState.ENGAGED:
         reach_mps2 = np.maximum(reach_mps2, controller.limits.accel_mps2)
+    if has_landed:
+        velocity_mps, reach_mps2 = np.zeros(3), np.zeros(3)
     choice = state.cells.choice
     return format_report(
         Report(

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from uavctl.account import FlightAccount
 from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
-from uavctl.cell_report import find_conduct, make_report
+from uavctl.cell_report import find_conduct, has_landed, make_report
 from uavctl.config import Config
 from uavctl.errors import TickOverdueError, in_words
 from uavctl.event_codes import EventCode
@@ -492,7 +492,14 @@ class ControlLoop:
         conduct = self._find_conduct()
         height_m = self._hand_over.height_m if self._hand_over.is_ordered_flight else 0.0
         return make_report(
-            self._state, self._controller, self._estimate, self._decision, self.handover_state, conduct, height_m
+            self._state,
+            self._controller,
+            self._estimate,
+            self._decision,
+            self.handover_state,
+            conduct,
+            height_m,
+            has_landed=has_landed(self.handover_state, self._vehicle),
         )
 
     @property

@@ -302,7 +302,7 @@ class CellReport(Record, frozen=True, kw_only=True):
     in_use: int  # number of the cell in use; 0 without one
     decided: int  # number of the newest cell that was taken or refused
     conduct: Conduct
-    reach_mps2: Vec3  # largest acceleration of each axis, where it is free
+    reach_mps2: Vec3  # largest acceleration of each axis, where it is free; zero once it has landed
 
 
 class StepInput(Record, frozen=True, kw_only=True):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from uavctl.arrays import Array
 from uavctl.fleet.boxes import Boxes, find_gaps
 from uavctl.fleet.cell import NO_CHOICE, CellChoice, MovingCell, PlannedPath, Report, decide_cell
 from uavctl.fleet.coordinator import CellParameters, advance, begin, begin_without_cells, issue, receive
@@ -174,12 +175,31 @@ def test_cells_keep_away_from_a_released_vehicle_or_their_vehicle_is_told_to_lan
         for s in range(len(times_s)):
             for cell in kept:
                 offset_m = np.maximum(cell.lower_m[s] - position_m, position_m - cell.upper_m[s])
-                assert (offset_m / np.array([0.5, 0.5, 1.5])).max() >= 1.0
+                assert offset_m[:2].max() >= PARAMETERS.distance_m - 1e-9
             after = np.clip(velocity + 0.1 * accel[s], -PARAMETERS.speed_mps, PARAMETERS.speed_mps)
             position_m, velocity = position_m + 0.05 * (velocity + after), after
     # Seen again after two seconds of silence, it may be anywhere: all others land
     state = issue(advance(state, 20), PARAMETERS)
     assert all(cell.land for cell in state.newest[:4])
+
+
+@pytest.mark.parametrize(("reach_mps2", "lands"), [(0.0, False), (0.5, True)])
+def test_others_land_for_a_silent_vehicle_unless_it_has_landed(reach_mps2: float, lands: bool) -> None:
+    """The daemon of a vehicle that has landed ends: one that was told to land alone landed all."""
+    parameters = dataclasses.replace(PARAMETERS, silence_s=1.0)
+
+    def rest(step: int, place_m: Array, conduct: Conduct) -> Report:
+        path = PlannedPath(step, np.tile(place_m, (STAGES, 1)), np.zeros((STAGES, 3)))
+        return Report(path, np.zeros(3), 0, 0, conduct, goal_m=place_m, reach_mps2=np.full(3, reach_mps2))
+
+    places_m = STARTS_M.copy()
+    places_m[4, 2] = 0.0
+    reports = [rest(0, places_m[i], Conduct.PATH if i == 4 else Conduct.REST) for i in range(5)]
+    state = begin_without_cells(0, reports, parameters)
+    known = {i: rest(200, places_m[i], Conduct.REST) for i in range(4)}
+    state = issue(receive(advance(state, 200), known), parameters)
+    assert [cell.land for cell in state.newest[:4]] == [lands] * 4
+    assert state.waits[4] == "silent"
 
 
 def test_the_place_to_land_at_stays_and_is_reached() -> None:

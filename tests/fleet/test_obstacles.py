@@ -27,6 +27,12 @@ def test_every_motion_within_the_limits_stays_inside_and_one_touches_each_side()
     assert (upper_m - highest_m).max() <= 0.5 * ACCEL.max() * dt_s**2 + 1e-9
 
 
+def test_a_vehicle_at_rest_without_acceleration_stays() -> None:
+    place_m = np.array([1.0, -2.0, 0.0])
+    for side_m in find_reach(place_m, np.zeros(3), np.zeros(3), SPEED, np.array([0.0, 2.0, 600.0])):
+        np.testing.assert_array_equal(side_m, np.tile(place_m, (3, 1)))
+
+
 def test_a_vehicle_faster_than_the_limit_keeps_its_speed() -> None:
     _, upper_m = find_reach(np.zeros(3), np.array([3.0, 0.0, 0.0]), ACCEL, SPEED, np.array([0.0, 2.0]))
     np.testing.assert_allclose(upper_m[:, 0], [0.0, 6.0])
