@@ -79,19 +79,20 @@ def refuse_existing_files(targets: Sequence[Path], *, force: bool) -> None:
         raise UsageError(f"{there[0]} exists{more}; --force overwrites, --out chooses another place")
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file; if it cannot be written whole, the file of before stays as it was.
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file, text as UTF-8; if it cannot be written whole, the file of before stays as it was.
 
     Raises:
         RecordingError: It cannot be written.
     """
+    data = content.encode() if isinstance(content, str) else content
     part = path.with_name(path.name + _UNFINISHED)
     device = path.exists() and not path.is_file()  # /dev/stdout has no other name to come from
     try:
         if device:
-            path.write_text(text, encoding="utf-8")
+            path.write_bytes(data)
             return
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(data)
         part.replace(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from logs.recording.output_files import refuse_recording_path
+from logs.report.paper_figure import WIDTHS_IN, Sheet, Width, draw_flight, make_figure
 from uavctl.api.control import Runs, Signal, SolvedPlan, get_limits, list_signals
 from uavctl.api.flights import Flight, Recording
 from uavctl.arrays import Array
@@ -18,77 +17,12 @@ from uavctl.smpc.plant import AXES
 from uavctl.wiring.controller import build_problem
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Width = Literal["column", "page"]
-WIDTHS_IN = {"column": 3.5, "page": 7.16}  # of a column, and of both with the gap between: IEEE's two-column papers
-# Type 42 embeds whole fonts, as publishers ask; matplotlib's default, type 3, is refused. An SVG has outlines.
-_EMBEDDED: dict[str, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path"}
-_PAPER: dict[str, Any] = {
-    **_EMBEDDED,
-    "font.size": 8.0,
-    "axes.titlesize": 8.0,
-    "axes.labelsize": 8.0,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "legend.fontsize": 7.0,
-    "axes.linewidth": 0.6,
-    "lines.linewidth": 1.2,
-}
-_SUFFIXES = (".pdf", ".svg", ".eps", ".png")
-_DOTS_PER_INCH = 300  # of a PNG
-_NOTEBOOK_COLOURS = ("C0", "C1", "C2")
-# Tol's high-contrast set: as grey, 25, 46 and 70 % light (https://sronpersonalpages.nl/~pault/, 2021).
-_PAPER_COLOURS = ("#004488", "#bb5566", "#ddaa33")
 _LINES = ("-", "-.", (0, (4, 1, 1, 1, 1, 1)))  # of several controllers
 _QUANTILES = (0.05, 0.5, 0.95)
-_PANELS_PER_ROW = 3
 _MAX_PANELS = 12
-
-
-@dataclass(frozen=True)
-class _Sheet:
-    """A figure being drawn."""
-
-    figure: Figure
-    width: Width | None
-    entries: dict[str, Artist] = field(default_factory=dict)  # of the legend of all panels, in a paper
-
-    def add_legend(self, ax: Axes) -> None:
-        """Add the legend of a panel; in a paper one below all panels, where it covers no line."""
-        if self.width is None:
-            ax.legend(fontsize=7.0)
-            return
-        handles, labels = ax.get_legend_handles_labels()
-        self.entries.update({label: self.entries.get(label, one) for label, one in zip(labels, handles, strict=True)})
-
-    def draw_legend(self) -> None:
-        """Draw the legend of all panels."""
-        if self.entries:
-            columns = 3 if self.width == "column" else len(self.entries)
-            self.figure.legend(
-                self.entries.values(), self.entries.keys(), loc="outside lower center", ncols=columns, frameon=False
-            )
-
-    def get_colour(self, number: int) -> str:
-        """Return the colour of a signal or controller."""
-        colours = _NOTEBOOK_COLOURS if self.width is None else _PAPER_COLOURS
-        return colours[number % len(colours)]
-
-    def make_axes(self, count: int) -> Iterator[Axes]:
-        """Make as many axes, a few in a row; in a column one below the other."""
-        columns = 1 if self.width == "column" else min(_PANELS_PER_ROW, count)
-        rows = -(-count // columns)
-        size_in = (3.4 * columns + 0.6, 2.9 * rows)
-        if self.width is not None:
-            size_in = (WIDTHS_IN[self.width], (1.7 if self.width == "column" else 2.1) * rows)
-        self.figure.set_size_inches(*size_in)
-        for position in range(count):
-            ax = self.figure.add_subplot(rows, columns, position + 1)
-            ax.grid(visible=True, alpha=0.3)
-            yield ax
 
 
 def plot(
@@ -110,27 +44,14 @@ def plot(
 
     Raises:
         UsageError: It has no figure, or the file has another ending.
-        RecordingError: Nothing was flown in the recording.
+        RecordingError: Nothing was flown in the recording, or the file cannot be written.
     """
-    from matplotlib import style
-    from matplotlib.figure import Figure
-
     if width is not None and width not in WIDTHS_IN:
         raise UsageError(f"width {width!r}: give {' or '.join(WIDTHS_IN)}")
-    if path is not None and Path(path).suffix.lower() not in _SUFFIXES:
-        raise UsageError(f"{path}: is no file of a figure; end its name with {', '.join(_SUFFIXES)}")
-    with style.context(_EMBEDDED if width is None else _PAPER):
-        figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-        sheet = _Sheet(figure, width)
-        _draw(sheet, what)
-        sheet.draw_legend()
-        if path is not None:
-            refuse_recording_path(Path(path))
-            figure.savefig(path, dpi=_DOTS_PER_INCH)
-    return figure
+    return make_figure(lambda sheet: _draw(sheet, what), width, None if path is None else Path(path))
 
 
-def _draw(sheet: _Sheet, what: object) -> None:
+def _draw(sheet: Sheet, what: object) -> None:
     if isinstance(what, SolvedPlan):
         _draw_plan(sheet, what)
     elif isinstance(what, Runs):
@@ -138,9 +59,9 @@ def _draw(sheet: _Sheet, what: object) -> None:
     elif isinstance(what, list | tuple) and what and all(isinstance(one, Runs) for one in what):
         _draw_runs(sheet, what)
     elif isinstance(what, Flight):
-        _draw_path(sheet, what.recording)
+        draw_flight(sheet, what.recording.data)
     elif isinstance(what, Recording):
-        _draw_path(sheet, what)
+        draw_flight(sheet, what.data)
     else:
         raise UsageError(f"a {type(what).__name__} has no figure; give a result of solve, simulate, fly or read")
 
@@ -167,7 +88,7 @@ def _group_panels(
     return list(panels.values())
 
 
-def _draw_plan(sheet: _Sheet, plan: SolvedPlan) -> None:
+def _draw_plan(sheet: Sheet, plan: SolvedPlan) -> None:
     if not plan.inputs.size:
         raise UsageError(f"there is no plan to draw: {plan!r}")
     (states, inputs), (state_limits, input_limits) = list_signals(plan.config), get_limits(plan.config)
@@ -184,7 +105,7 @@ def _draw_plan(sheet: _Sheet, plan: SolvedPlan) -> None:
         _add_legend(sheet, ax, panel)
 
 
-def _draw_runs(sheet: _Sheet, compared: Sequence[Runs]) -> None:
+def _draw_runs(sheet: Sheet, compared: Sequence[Runs]) -> None:
     config = compared[0].config
     for runs in compared:
         if runs.failed.all():
@@ -228,14 +149,14 @@ def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, co
         ax.axhline(target, ls=":", lw=1.0, color=colour)
 
 
-def _add_legend(sheet: _Sheet, ax: Axes, panel: _Panel) -> None:
+def _add_legend(sheet: Sheet, ax: Axes, panel: _Panel) -> None:
     ax.plot([], [], ls="--", lw=1.0, color="0.4", label="limit")
     if any(target is not None for *_, target in panel.rows):
         ax.plot([], [], ls=":", lw=1.0, color="0.4", label="target")
     sheet.add_legend(ax)
 
 
-def _make_grid(sheet: _Sheet, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
+def _make_grid(sheet: Sheet, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
     """Yield axes for the first panels, with unit and time, and with a title outside of papers."""
     shown = panels[:_MAX_PANELS]
     for ax, panel in zip(sheet.make_axes(len(shown)), shown, strict=True):
@@ -244,20 +165,3 @@ def _make_grid(sheet: _Sheet, panels: Sequence[_Panel], x_label: str) -> Iterato
         if sheet.width is None:
             ax.set_title(panel.title.capitalize())
         yield ax, panel
-
-
-def _draw_path(sheet: _Sheet, recording: Recording) -> None:
-    from logs.report.plots import draw_path, make_path_legend
-
-    data = recording.data
-    views = [("From above", ("east", "north"))]
-    if "down" in data.design.axes:
-        views.append(("From the south", ("east", "down")))
-    for ax, (title, view_axes) in zip(sheet.make_axes(len(views)), views, strict=True):
-        names = ["height" if axis == "down" else axis for axis in view_axes]
-        ax.set(title=title, xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")
-        draw_path(ax, data, view_axes)
-    if sheet.width is not None:
-        size_in = sheet.figure.get_size_inches()
-        sheet.figure.set_size_inches(size_in[0], size_in[1] * (1.6 if sheet.width == "column" else 1.4))
-    sheet.entries.update({str(line.get_label()): line for line in make_path_legend(data)})

@@ -39,6 +39,7 @@ from logs.report.fleet import PAGE, is_fleet_folder, read_fleet
 from logs.report.fleet_page import derive_banner, write_fleet_page
 from logs.report.flight_page import write_report
 from logs.report.headline import derive_headline
+from logs.report.paper_figure import Width, check_figure_path, draw_flight, make_figure
 from logs.report.tlog_headline import derive_tlog_headline
 from logs.report.tlog_page import write_tlog_page
 from logs.report.verdict_sections import make_verdict_rows
@@ -121,6 +122,12 @@ def report(
     *,
     out: Annotated[Path | None, Parameter(help="page to write; else beside the recording")] = None,
     svg: Annotated[Path | None, Parameter(help="also write a small picture of the flight")] = None,
+    figure: Annotated[
+        Path | None, Parameter(help="also write the path as a figure for a paper: .pdf, .svg, .eps or .png")
+    ] = None,
+    width: Annotated[
+        Width | None, Parameter(help="with --figure: 3.5 in (column) or 7.16 in; else column", show_default=False)
+    ] = None,
     system: System = None,
     rehearsals: Rehearsals = None,
     json: Json = False,
@@ -129,20 +136,27 @@ def report(
 
     The page has the probability that such a flight leaves the room, by rehearsals, beside the observed share.
     """
+    if width is not None and figure is None:
+        raise UsageError("--width is that of --figure; name its file, too")
+    picture = next((name for name, path in (("--svg", svg), ("--figure", figure)) if path is not None), None)
     if is_fleet_folder(flight):
-        return _report_fleet(flight, out, svg, Common(json=json))
+        return _report_fleet(flight, out, picture, Common(json=json))
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         refuse_recording_path(target)
+    if figure is not None:
+        check_figure_path(figure)
     foreign = read_foreign_flight(flight, system)
     if foreign is not None:
-        return _report_foreign(flight, foreign, page, svg, Common(json=json))
+        return _report_foreign(flight, foreign, page, picture, Common(json=json))
     data = FlightData.from_records(read(flight), flight)
     dropped = max((note.dropped for note in data.notes), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
     verdicts = judge_flight(data, _rehearse_flown(data, rehearsals))
     if svg is not None:
         write_atomically(svg, draw_overview(data))
+    if figure is not None:
+        make_figure(lambda sheet: draw_flight(sheet, data), width or "column", figure)
     write_report(data, summary, page, verdicts)
     if cut := explain_missing_end(flight):
         warn(f"{cut}: shown up to there")
@@ -156,10 +170,10 @@ def report(
     return 0
 
 
-def _report_fleet(folder: Path, out: Path | None, svg: Path | None, common: Common) -> int:
+def _report_fleet(folder: Path, out: Path | None, picture: str | None, common: Common) -> int:
     """Write the page of a fleet's folder."""
-    if svg is not None:
-        raise UsageError(f"--svg draws one flight; {folder} is the folder of a fleet, and of it there is the page")
+    if picture is not None:
+        raise UsageError(f"{picture} draws one flight; {folder} is the folder of a fleet, and of it there is the page")
     page = out if out is not None else folder / PAGE
     refuse_recording_path(page)
     fleet = read_fleet(folder)
@@ -190,9 +204,9 @@ def _render_report(headline: Headline, summary: RenderableType) -> Group:
     return Group(make_headline_text(headline), *(Text(f"  {sentence}") for sentence in headline.reasons), summary)
 
 
-def _report_foreign(flight: Path, foreign: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
-    if svg is not None:
-        raise UsageError(f"--svg needs a recording of uavctl; {flight} is another one, and has the page only")
+def _report_foreign(flight: Path, foreign: MavlinkFlight, out: Path, picture: str | None, common: Common) -> int:
+    if picture is not None:
+        raise UsageError(f"{picture} needs a recording of uavctl; {flight} is another one, and has the page only")
     write_tlog_page(foreign, out)
     for note in foreign.info.notes:
         warn(note)

@@ -184,7 +184,10 @@ def test_a_torn_one_is_shown_up_to_there(tmp_path: Path, exported: Path, capsys:
     assert run(["log", "report", str(path), "--json"]) == 0
     told = capsys.readouterr()
     assert json.loads(told.out)["notes"] and "torn" in told.err
-    assert run(["log", "report", str(path), "--svg", str(tmp_path / "a.svg")]) == 2
+    for option in ("--svg", "--figure"):
+        assert run(["log", "report", str(path), option, str(tmp_path / "a.svg")]) == 2
+        assert f"{option} needs a recording of uavctl" in " ".join(capsys.readouterr().err.split())
+        assert not (tmp_path / "a.svg").exists()
 
 
 def beat(mode: int, *, armed: bool) -> Any:
