@@ -76,6 +76,7 @@ class EventCode(StrEnum):
     HUNG_UP = "hung-up"  # the other side has closed a TCP connection
     CONNECTION_SILENT = "went-silent"  # nothing came over a TCP connection any more
     PROCESS_ENDED = "process-ended"  # the process that listens to cameras has ended
+    SEVERAL_PUBLISHERS = "several-publishers"  # another node of ROS 2 publishes positions on the same topic
     CLOCK_RESYNC = "clock-resync"
     STAMP_UNIT = "stamp-unit"
     SLOW_ANSWER = "timesync"  # answers to TIMESYNC were too slow to be used

@@ -83,6 +83,7 @@ CONSOLE_CODES = frozenset(
         EventCode.HUNG_UP,
         EventCode.CONNECTION_SILENT,
         EventCode.PROCESS_ENDED,
+        EventCode.SEVERAL_PUBLISHERS,
         EventCode.NO_HEARTBEAT,
         EventCode.STAMP_UNIT,
         EventCode.INTERNAL_ERROR,

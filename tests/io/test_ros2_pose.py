@@ -18,7 +18,9 @@ from uavctl.io.ros2_pose import (
     OTHER_FRAME,
     POSE_TYPES,
     UNTRACKED,
+    OnePublisher,
     PoseReader,
+    Publisher,
     choose_type,
     describe_pose_topics,
 )
@@ -113,13 +115,20 @@ def test_frames_of_the_url_decide() -> None:
 
 
 def test_a_topic_has_one_publisher_of_poses() -> None:
-    assert choose_type("/drone/pose", [("driver", NAMES[ODOMETRY])]) == NAMES[ODOMETRY]
+    assert choose_type("/drone/pose", [Publisher("driver", NAMES[ODOMETRY])]) == NAMES[ODOMETRY]
     with pytest.raises(CameraError, match=r"2 publishers \(a, b\)"):
-        choose_type("/drone/pose", [("b", NAMES[POSE]), ("a", NAMES[POSE])])
+        choose_type("/drone/pose", [Publisher("b", NAMES[POSE]), Publisher("a", NAMES[POSE])])
     with pytest.raises(CameraError, match="of imu has sensor_msgs/msg/Imu; poses are"):
-        choose_type("/drone/imu", [("imu", "sensor_msgs/msg/Imu")])
+        choose_type("/drone/imu", [Publisher("imu", "sensor_msgs/msg/Imu")])
     topics = [("/b", [NAMES[POSE]]), ("/a", [NAMES[TRANSFORM], "x/msg/Y"]), ("/rosout", ["rcl_interfaces/msg/Log"])]
     assert describe_pose_topics(topics).endswith(": /a, /b")
+
+
+def test_the_first_publisher_counts_until_it_is_silent_for_a_second() -> None:
+    one = OnePublisher(1.0)
+    for gid, at_s, counts in ((b"a", 0.0, True), (b"b", 0.5, False), (b"a", 1.0, True), (b"b", 2.0, False)):
+        assert one.accepts(gid, at_s) is counts
+    assert one.accepts(b"b", 2.1) and not one.accepts(b"a", 2.2)
 
 
 @pytest.mark.parametrize(

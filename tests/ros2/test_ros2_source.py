@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from typing import Any
 
 import pytest
@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 from uavctl.config import load_config
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.base import Connection
-from uavctl.io.ros2_host import NO_PUBLISHER
+from uavctl.io.ros2_host import NO_PUBLISHER, SEVERAL_PUBLISHERS
 from uavctl.io.sources import open_source
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.encoder import Encoder
@@ -178,6 +178,34 @@ def test_a_driver_that_starts_again_is_heard_again(node: Any) -> None:
         with published(node, TOPIC, PoseStamped, poses_of(node, PoseStamped)):
             receive(connection, Position)
         assert not connection.closed
+
+
+@pytest.mark.fault(106)
+def test_106_of_two_real_publishers_the_first_counts_until_it_ends(node: Any) -> None:
+    def make_other() -> Any:
+        message = make_message(PoseStamped, node.get_clock().now().to_msg())
+        message.pose.position.x = 9.0
+        return message
+
+    other, found = rclpy.create_node("player", namespace="bag"), list[Position]()
+
+    def look(connection: Connection, condition: Callable[[], bool]) -> bool:
+        found.extend(position for position, _ in receive(connection, Position))
+        return condition()
+
+    with ExitStack() as driver:
+        driver.enter_context(published(node, TOPIC, PoseStamped, poses_of(node, PoseStamped)))
+        with (
+            closing(open_source("ros2://drone/pose?frame=map")) as connection,
+            published(other, TOPIC, PoseStamped, make_other),
+        ):
+            wait_until(lambda: look(connection, lambda: connection.refused[SEVERAL_PUBLISHERS] > 20), "it is refused")
+            assert {position.position_m[1] for position in found} == {1.0}
+            (reason,) = [reason for reason in connection.refused if ": " in reason]
+            assert reason.index("/driver") < reason.index("/bag/player")  # the one that is used comes first
+            driver.close()
+            wait_until(lambda: look(connection, lambda: found[-1].position_m[1] == 9.0), "the other takes its place")
+    other.destroy_node()
 
 
 def start_source(node: Any) -> Connection:

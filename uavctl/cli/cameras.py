@@ -24,7 +24,6 @@ from uavctl.config.types import Config
 from uavctl.errors import ConfigError, ConnectionSpecError
 from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
-from uavctl.io.camera_process import PROCESS_ENDED
 from uavctl.io.shared_sources import SharedSource, find_shared_sources, split_source_url
 from uavctl.io.signed_connection import make_admission_rules, sign_sender
 from uavctl.io.sources import open_bodies
@@ -149,7 +148,7 @@ class _Run:
             if connection.closed:
                 self._report_once(f"{side} {connection.url} is closed")
             for reason in connection.refused:
-                if reason.startswith(PROCESS_ENDED):
+                if ": " in reason:  # with a cause
                     self._report_once(f"{side} {connection.url}: {reason}")
         failure = self._recording.failure
         if failure and not self._has_failed:

@@ -3,7 +3,7 @@
 The daemon starts it as `python -m uavctl.io.ros2_host FD TOPIC FRAME CHILD CLOCK`.
 
 1. Wait for the topic's publisher, and subscribe best-effort with a short queue, as for sensor data.
-2. Encode poses as MAVLink, and send them to the daemon (`uavctl.io.daemon_pipe`).
+2. Encode poses of the first publisher as MAVLink, and send them to the daemon (`uavctl.io.daemon_pipe`).
 3. Answer time requests where the clock of the stamps is known: by the system's time, or by the next message of /clock.
 4. End when the daemon has closed its end, or has died.
 """
@@ -20,21 +20,23 @@ from functools import partial
 from typing import Any, cast
 
 from uavctl.arrays import SECOND_NS
+from uavctl.event_codes import EventCode
 from uavctl.io.camera import ANSWER_S, LARGEST, CameraError, Echo
 from uavctl.io.camera_host import CameraMessageEncoder, parse_time_requests
 from uavctl.io.daemon_pipe import DaemonPipe, serve_daemon
 from uavctl.io.ros2_node import Ros2Node, open_node
-from uavctl.io.ros2_pose import PoseReader, choose_type, describe_pose_topics
+from uavctl.io.ros2_pose import OnePublisher, PoseReader, choose_type, describe_pose_topics, list_nodes
 from uavctl.io.ros2_url import Ros2Url, StampClock
 
 NO_PUBLISHER = "no-publisher"
-SEVERAL_PUBLISHERS = "several-publishers"
+SEVERAL_PUBLISHERS = EventCode.SEVERAL_PUBLISHERS.value
 SILENT = "topic-silent"
 _CLOCK_TYPE, _CLOCK_TOPIC = "rosgraph_msgs/msg/Clock", "/clock"
 _MEMORY_LIMIT = 2**32  # addresses: Fast DDS maps shared memory, and each thread reserves some
 _POLL_S = 0.05
 _WATCH_S = 0.5  # between two looks at the publishers
 _SILENT_S = 1.0
+_MAX_REPORTS = 8  # cases of several publishers
 _MAX_REQUESTS = 8  # time requests that wait for /clock
 
 
@@ -56,6 +58,8 @@ class Ros2Host:
         self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)
         self._dropped: Counter[str] = Counter()
         self._heard_s = self._watched_s = time.monotonic()
+        self._source, self._are_mixed = OnePublisher(_SILENT_S), False
+        self._reported: set[str] = set()  # reasons that name publishers
 
     def run(self) -> None:
         """Run until the daemon has gone.
@@ -95,21 +99,44 @@ class Ros2Host:
                 return
         kind = choose_type(self._url.topic, publishers)
         self._reader = PoseReader(kind, self._url.topic, self._url.frame, self._url.child)
-        self._node.subscribe(kind, self._url.topic, partial(self._receive_pose, self._reader))
+        self._node.subscribe_with_gid(kind, self._url.topic, partial(self._receive_pose, self._reader))
 
     def _watch_publishers(self) -> None:
-        """Count times at which the topic is silent, or not one publisher's."""
+        """Count times at which the topic is silent; note whether poses mix that no identifier keeps apart."""
         now_s = time.monotonic()
         if now_s - self._watched_s < _WATCH_S:
             return
         self._watched_s = now_s
-        count = len(self._node.list_publishers(self._url.topic))
-        if count > 1:
-            self._dropped[SEVERAL_PUBLISHERS] += 1
+        publishers = self._node.list_publishers(self._url.topic)
+        self._are_mixed = len(publishers) > 1 and self._source.gid == b""
+        if self._are_mixed:
+            self._report_publishers(f"positions of {list_nodes(publishers)} cannot be kept apart, and none is used")
         elif now_s - self._heard_s > _SILENT_S:
-            self._dropped[SILENT if count else NO_PUBLISHER] += 1
+            self._dropped[SILENT if publishers else NO_PUBLISHER] += 1
 
-    def _receive_pose(self, reader: PoseReader, message: Any) -> None:
+    def _is_used(self, gid: bytes) -> bool:
+        """Return whether a pose counts, by the identifier of its publisher; report another publisher."""
+        before = self._source.gid
+        is_used = self._source.accepts(gid, time.monotonic()) and not self._are_mixed
+        if not is_used:
+            self._dropped[SEVERAL_PUBLISHERS] += 1
+        publishers = [] if before in (None, gid) else self._node.list_publishers(self._url.topic)
+        if before is not None and len(publishers) > 1:  # else the driver has started again
+            names = {publisher.gid: publisher.node for publisher in publishers}
+            used, other = (names.get(one, "a node") for one in ((gid, before) if is_used else (before, gid)))
+            self._report_publishers(f"positions of {used} are used, those of {other} are not")
+        return is_used
+
+    def _report_publishers(self, effect: str) -> None:
+        """Report which publishers there are, each case once."""
+        reason = f"{SEVERAL_PUBLISHERS}: {self._url.topic} has several publishers: {effect}"
+        if reason not in self._reported and len(self._reported) < _MAX_REPORTS:
+            self._reported.add(reason)
+            self._dropped[reason] += 1
+
+    def _receive_pose(self, reader: PoseReader, message: Any, gid: bytes) -> None:
+        if not self._is_used(gid):
+            return
         self._heard_s = time.monotonic()
         try:
             pose = reader.read(message)

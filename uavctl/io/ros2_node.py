@@ -13,6 +13,7 @@ from typing import Any
 
 from uavctl.errors import in_words
 from uavctl.io.camera import CameraError
+from uavctl.io.ros2_pose import Publisher
 
 EXTRA = "ros2"
 _RELIABLE_DEPTH = 10  # messages that wait; a number alone is a reliable subscription
@@ -39,6 +40,19 @@ class Ros2Node:
         """
         qos = _RELIABLE_DEPTH if is_reliable else self._sensor_qos
         self._node.create_subscription(import_type(kind), topic, receive, qos)
+
+    def subscribe_with_gid(self, kind: str, topic: str, receive: Callable[[Any, bytes], None]) -> None:
+        """Subscribe best-effort; a message comes with the identifier of its publisher, empty if that is not known.
+
+        Args:
+            kind: Type of the messages.
+        """
+
+        def take(message: Any, info: Mapping[str, Any]) -> None:
+            gid = info.get("publisher_gid")  # no rclpy before 9.1 gives one
+            receive(message, bytes(gid["data"]) if gid else b"")
+
+        self._node.create_subscription(import_type(kind), topic, take, self._sensor_qos)
 
     def advertise(self, kind: str, topic: str, *, is_latched: bool = False) -> Callable[[Mapping[str, Any]], None]:
         """Offer a topic; return the function that publishes a message by its fields.
@@ -68,10 +82,15 @@ class Ros2Node:
 
         self._node.create_service(import_type(kind), name, answer)
 
-    def list_publishers(self, topic: str) -> list[tuple[str, str]]:
-        """Return the node and the type of each publisher of a topic."""
+    def list_publishers(self, topic: str) -> list[Publisher]:
+        """Return the publishers of a topic."""
         return [
-            (publisher.node_name, publisher.topic_type) for publisher in self._node.get_publishers_info_by_topic(topic)
+            Publisher(
+                f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}",
+                publisher.topic_type,
+                bytes(publisher.endpoint_gid),
+            )
+            for publisher in self._node.get_publishers_info_by_topic(topic)
         ]
 
     def list_topics(self) -> list[tuple[str, list[str]]]:

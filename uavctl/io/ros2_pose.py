@@ -45,6 +45,41 @@ _READERS: Mapping[str, Callable[[Any], _Fields]] = {
 POSE_TYPES = tuple(_READERS)
 
 
+class Publisher(NamedTuple):
+    """A publisher of a topic."""
+
+    node: str
+    kind: str  # type of its messages
+    gid: bytes = b""  # its identifier
+
+
+class OnePublisher:
+    """Chooses the publisher whose poses count: the first, until it is silent. Two would mix.
+
+    Args:
+        silent_s: Time without a pose after which another one may take its place [s].
+
+    Attributes:
+        gid: Identifier of the chosen publisher; None before the first pose.
+    """
+
+    def __init__(self, silent_s: float) -> None:
+        self._silent_s = silent_s
+        self._heard_s = 0.0
+        self.gid: bytes | None = None
+
+    def accepts(self, gid: bytes, at_s: float) -> bool:
+        """Return whether a pose counts that a publisher sends.
+
+        Args:
+            at_s: Time of its arrival [s].
+        """
+        if gid != self.gid and self.gid is not None and at_s - self._heard_s <= self._silent_s:
+            return False
+        self.gid, self._heard_s = gid, at_s
+        return True
+
+
 class PoseReader:
     """Reads the poses of one body out of the messages of one topic.
 
@@ -118,24 +153,26 @@ def _convert_covariance(covariance: Sequence[float] | None) -> tuple[float, ...]
     return convert_covariance_to_ned(covariance, "enu")
 
 
-def choose_type(topic: str, publishers: Sequence[tuple[str, str]]) -> str:
+def choose_type(topic: str, publishers: Sequence[Publisher]) -> str:
     """Return the type of a topic's messages.
-
-    Args:
-        publishers: Node and type of each.
 
     Raises:
         CameraError: It has not one publisher, or its messages are no poses.
     """
     if len(publishers) > 1:
-        nodes = ", ".join(sorted(node for node, _ in publishers))
         raise CameraError(
-            f"{topic} has {len(publishers)} publishers ({nodes}), whose poses would mix; give each a topic of its own"
+            f"{topic} has {len(publishers)} publishers ({list_nodes(publishers)}), whose poses would mix; give each a "
+            "topic of its own"
         )
-    ((node, kind),) = publishers
-    if kind not in _READERS:
-        raise CameraError(f"{topic} of {node} has {kind}; poses are {', '.join(POSE_TYPES)}")
-    return kind
+    (publisher,) = publishers
+    if publisher.kind not in _READERS:
+        raise CameraError(f"{topic} of {publisher.node} has {publisher.kind}; poses are {', '.join(POSE_TYPES)}")
+    return publisher.kind
+
+
+def list_nodes(publishers: Sequence[Publisher]) -> str:
+    """Return the names of the publishers' nodes in words."""
+    return ", ".join(sorted(publisher.node for publisher in publishers))
 
 
 def describe_pose_topics(topics: Sequence[tuple[str, Sequence[str]]]) -> str:

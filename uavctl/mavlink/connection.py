@@ -232,6 +232,8 @@ class MavlinkConnection:
             if code == EventCode.PROCESS_ENDED:
                 text = f"the camera process has ended: {cause}"
                 events.append(self._make_event(at_ns, Severity.ERROR, EventCode.PROCESS_ENDED, text))
+            elif code == EventCode.SEVERAL_PUBLISHERS and cause:  # with a cause it comes once, else with each pose
+                events.append(self._make_event(at_ns, Severity.ERROR, EventCode.SEVERAL_PUBLISHERS, cause))
         return (*events, *self._make_events(at_ns))
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
