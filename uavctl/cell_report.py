@@ -4,7 +4,7 @@
 2. On the ground, and in its own climb or landing, it moves along a column: up to the height of the climb that was
    ordered, or down to the floor.
 3. Braking and holding, it is free, with what may drive it. With its pilot or a failsafe, only its limits count.
-4. After its landing it does not move, also where nobody hears of it any more.
+4. After its landing it does not move, also once no report comes any more.
 """
 
 from __future__ import annotations

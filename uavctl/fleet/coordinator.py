@@ -208,7 +208,7 @@ def receive(state: CoordinatorState, reports: Mapping[int, Report]) -> Coordinat
     """Take up reports by the number of the vehicle; older ones than the newest known change nothing.
 
     Raises:
-        ValueError: A vehicle uses a cell that was not issued to it, whose sides nobody here knows.
+        ValueError: A vehicle uses a cell that was not issued to it: its sides are unknown.
     """
     newest, numbers, in_use, exits = list(state.reports), list(state.used_numbers), list(state.newest), [*state.exits]
     is_taken, is_decided, has_left = (np.zeros(len(newest), dtype=bool) for _ in range(3))
