@@ -86,9 +86,9 @@ $(CLIENTS)/.installed: constraints-clients.txt
 
 $(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
 	$(PYTHON) -m venv $(LOWEST)
-	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check setuptools wheel
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check 'setuptools>=77' wheel
 	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-lowest.txt --no-build-isolation \
-		-e '.[campaign,pandas,polars,ulog]' hypothesis pytest pytest-xdist
+		-e '.[campaign,pandas,polars,ulog]' hypothesis mcap-ros1-support mcap-ros2-support pytest pytest-xdist
 	touch $@
 
 $(ROS2)/.installed: pyproject.toml constraints.txt constraints-ros2.txt
