@@ -265,8 +265,10 @@ def test_the_radio_of_the_page_sends_to_four_vehicles(shell: ManualShell) -> Non
 def test_the_orders_of_the_page_succeed(shell: ManualShell) -> None:
     shell.wait_for_text(shell.start(f"uavctl sim --config room-px4 {LONG_TIMEOUT}"), "system_id")
     accepted = f"--set 'check.accept={json.dumps(TIMED_ITEMS + TIMEOUTS)}'"
-    flight = shell.start(f"uavctl fly --config room-px4 --arm --takeoff 1.2 {accepted}")
-    shell.wait_for_success(FLIGHT_TRACKS)
+    flight = shell.start(f"uavctl fly --config room-px4 {accepted}")
+    shell.wait_for_success("uavctl ctl status --json | grep -q '\"armed\": *false'")
     for order in filter(is_run, find_commands("docs/operation.md")):
         shell.run(order, code=1 if order == "uavctl ctl engage" else 0)
+        if order.startswith("uavctl ctl takeoff"):
+            shell.wait_for_success(FLIGHT_TRACKS)
     shell.wait_for_end(flight, "fly")
