@@ -42,7 +42,7 @@ _PANELS_PER_ROW = 3
 
 
 @dataclass(frozen=True)
-class Sheet:
+class PanelFigure:
     """A figure being drawn."""
 
     figure: Figure
@@ -95,7 +95,7 @@ def check_figure_path(path: Path) -> None:
     refuse_recording_path(path)
 
 
-def make_figure(draw: Callable[[Sheet], None], width: Width | None, path: Path | None) -> Figure:
+def make_figure(draw: Callable[[PanelFigure], None], width: Width | None, path: Path | None) -> Figure:
     """Make a figure of what `draw` draws, and write it to a file if one is given.
 
     Raises:
@@ -106,9 +106,9 @@ def make_figure(draw: Callable[[Sheet], None], width: Width | None, path: Path |
         check_figure_path(path)
     with style.context(_EMBEDDED if width is None else _PAPER):
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-        sheet = Sheet(figure, width)
-        draw(sheet)
-        sheet.draw_legend()
+        drawing = PanelFigure(figure, width)
+        draw(drawing)
+        drawing.draw_legend()
         if path is not None:
             data = io.BytesIO()
             figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DOTS_PER_INCH)
@@ -116,16 +116,16 @@ def make_figure(draw: Callable[[Sheet], None], width: Width | None, path: Path |
     return figure
 
 
-def draw_flight(sheet: Sheet, data: FlightData) -> None:
+def draw_flight(drawing: PanelFigure, data: FlightData) -> None:
     """Draw the path of a flight from above, and from the south if the plant moves vertically."""
     views = [("From above", ("east", "north"))]
     if "down" in data.design.axes:
         views.append(("From the south", ("east", "down")))
-    for ax, (title, view_axes) in zip(sheet.make_axes(len(views)), views, strict=True):
+    for ax, (title, view_axes) in zip(drawing.make_axes(len(views)), views, strict=True):
         names = ["height" if axis == "down" else axis for axis in view_axes]
         ax.set(title=title, xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")
         draw_path(ax, data, view_axes)
-    if sheet.width is not None:
-        size_in = sheet.figure.get_size_inches()
-        sheet.figure.set_size_inches(size_in[0], size_in[1] * (1.6 if sheet.width == "column" else 1.4))
-    sheet.entries.update({str(line.get_label()): line for line in make_path_legend(data)})
+    if drawing.width is not None:
+        size_in = drawing.figure.get_size_inches()
+        drawing.figure.set_size_inches(size_in[0], size_in[1] * (1.6 if drawing.width == "column" else 1.4))
+    drawing.entries.update({str(line.get_label()): line for line in make_path_legend(data)})

@@ -45,7 +45,7 @@ def drive(port: int, publisher: Any) -> None:
                 publisher.publish(message)
 
 
-class Orders:
+class OrderClient:
     """The orders of a flight below a namespace."""
 
     def __init__(self, node: Any, namespace: str) -> None:
@@ -91,7 +91,7 @@ def main(port: str, topic: str, namespace: str) -> None:
     node = rclpy.create_node("user")
     publisher = node.create_publisher(PoseStamped, topic, qos_profile_sensor_data)
     threading.Thread(target=drive, args=(int(port), publisher), daemon=True).start()
-    orders = Orders(node, namespace)
+    orders = OrderClient(node, namespace)
     for line in sys.stdin:
         is_accepted, text = orders.give(line)
         sys.stdout.write(json.dumps({"ok": is_accepted, "text": text}) + "\n")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from logs.report.paper_figure import WIDTHS_IN, Sheet, Width, draw_flight, make_figure
+from logs.report.paper_figure import WIDTHS_IN, PanelFigure, Width, draw_flight, make_figure
 from uavctl.api.control import Runs, Signal, SolvedPlan, get_limits, list_signals
 from uavctl.api.flights import Flight, Recording
 from uavctl.arrays import Array
@@ -48,20 +48,20 @@ def plot(
     """
     if width is not None and width not in WIDTHS_IN:
         raise UsageError(f"width {width!r}: give {' or '.join(WIDTHS_IN)}")
-    return make_figure(lambda sheet: _draw(sheet, what), width, None if path is None else Path(path))
+    return make_figure(lambda drawing: _draw(drawing, what), width, None if path is None else Path(path))
 
 
-def _draw(sheet: Sheet, what: object) -> None:
+def _draw(drawing: PanelFigure, what: object) -> None:
     if isinstance(what, SolvedPlan):
-        _draw_plan(sheet, what)
+        _draw_plan(drawing, what)
     elif isinstance(what, Runs):
-        _draw_runs(sheet, [what])
+        _draw_runs(drawing, [what])
     elif isinstance(what, list | tuple) and what and all(isinstance(one, Runs) for one in what):
-        _draw_runs(sheet, what)
+        _draw_runs(drawing, what)
     elif isinstance(what, Flight):
-        draw_flight(sheet, what.recording.data)
+        draw_flight(drawing, what.recording.data)
     elif isinstance(what, Recording):
-        draw_flight(sheet, what.data)
+        draw_flight(drawing, what.data)
     else:
         raise UsageError(f"a {type(what).__name__} has no figure; give a result of solve, simulate, fly or read")
 
@@ -88,7 +88,7 @@ def _group_panels(
     return list(panels.values())
 
 
-def _draw_plan(sheet: Sheet, plan: SolvedPlan) -> None:
+def _draw_plan(drawing: PanelFigure, plan: SolvedPlan) -> None:
     if not plan.inputs.size:
         raise UsageError(f"there is no plan to draw: {plan!r}")
     (states, inputs), (state_limits, input_limits) = list_signals(plan.config), get_limits(plan.config)
@@ -96,16 +96,16 @@ def _draw_plan(sheet: Sheet, plan: SolvedPlan) -> None:
         *_group_panels(states, plan.states, state_limits, plan.reference),
         *_group_panels(inputs, plan.inputs, input_limits, None),
     ]
-    for ax, panel in _make_grid(sheet, panels, "time ahead [s]"):
+    for ax, panel in _make_grid(drawing, panels, "time ahead [s]"):
         for number, (label, values, limits, target) in enumerate(panel.rows):
             time_s = plan.config.plant.dt_s * np.arange(len(values))
             drawstyle = "steps-post" if len(values) < len(plan.states) else "default"
-            ax.plot(time_s, values, color=sheet.get_colour(number), label=label, drawstyle=drawstyle)
-            _draw_limits(ax, limits, target, sheet.get_colour(number))
-        _add_legend(sheet, ax, panel)
+            ax.plot(time_s, values, color=drawing.get_colour(number), label=label, drawstyle=drawstyle)
+            _draw_limits(ax, limits, target, drawing.get_colour(number))
+        _add_legend(drawing, ax, panel)
 
 
-def _draw_runs(sheet: Sheet, compared: Sequence[Runs]) -> None:
+def _draw_runs(drawing: PanelFigure, compared: Sequence[Runs]) -> None:
     config = compared[0].config
     for runs in compared:
         if runs.failed.all():
@@ -130,15 +130,15 @@ def _draw_runs(sheet: Sheet, compared: Sequence[Runs]) -> None:
         )
         for i in state_indices
     ]
-    for ax, panel in _make_grid(sheet, panels, "time [s]"):
+    for ax, panel in _make_grid(drawing, panels, "time [s]"):
         for number, (runs, (label, values, _, _)) in enumerate(zip(compared, panel.rows, strict=True)):
             low, middle, high = np.quantile(values[~runs.failed], _QUANTILES, axis=0)
-            paint, band = sheet.get_colour(number), "nine in ten runs" if number == 0 else None
+            paint, band = drawing.get_colour(number), "nine in ten runs" if number == 0 else None
             ax.fill_between(runs.time_s, low, high, color=paint, alpha=0.2, lw=0, label=band)
             ax.plot(runs.time_s, middle, color=paint, ls=_LINES[number % len(_LINES)], label=label)
         *_, limits_of_state, wanted = panel.rows[0]
-        _draw_limits(ax, limits_of_state, wanted, "0.4" if len(compared) > 1 or sheet.width else "C3")
-        _add_legend(sheet, ax, panel)
+        _draw_limits(ax, limits_of_state, wanted, "0.4" if len(compared) > 1 or drawing.width else "C3")
+        _add_legend(drawing, ax, panel)
 
 
 def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, colour: str) -> None:
@@ -149,19 +149,19 @@ def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, co
         ax.axhline(target, ls=":", lw=1.0, color=colour)
 
 
-def _add_legend(sheet: Sheet, ax: Axes, panel: _Panel) -> None:
+def _add_legend(drawing: PanelFigure, ax: Axes, panel: _Panel) -> None:
     ax.plot([], [], ls="--", lw=1.0, color="0.4", label="limit")
     if any(target is not None for *_, target in panel.rows):
         ax.plot([], [], ls=":", lw=1.0, color="0.4", label="target")
-    sheet.add_legend(ax)
+    drawing.add_legend(ax)
 
 
-def _make_grid(sheet: Sheet, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
+def _make_grid(drawing: PanelFigure, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
     """Yield axes for the first panels, with unit and time, and with a title outside of papers."""
     shown = panels[:_MAX_PANELS]
-    for ax, panel in zip(sheet.make_axes(len(shown)), shown, strict=True):
+    for ax, panel in zip(drawing.make_axes(len(shown)), shown, strict=True):
         unit = f" [{panel.unit}]" if panel.unit else ""
         ax.set(xlabel=x_label, ylabel=f"{panel.title}{unit}")
-        if sheet.width is None:
+        if drawing.width is None:
             ax.set_title(panel.title.capitalize())
         yield ax, panel
