@@ -30,7 +30,7 @@ test-long: $(STAMP)
 
 # Types the commands of the manual's pages as a reader would, in real time, against simulated vehicles.
 test-manual: $(STAMP)
-	$(VENV)/bin/python -m pytest -n 2 --dist loadgroup -m manual tests/e2e/test_manual.py
+	$(VENV)/bin/python -m pytest -n 2 -m manual tests/e2e/test_manual.py
 
 # The core, configurations, recordings and the Python API with the lowest versions that pyproject.toml permits.
 test-lowest: $(LOWEST)/.installed

@@ -60,9 +60,7 @@ TIMED_ITEMS = [
     "vehicle clock",
     "source clock",
 ]
-# Flights in real time follow each other: they share the vehicle's lock below /tmp, and the processor. Pages without a
-# flight run beside them, with less of the processor.
-IN_REAL_TIME = pytest.mark.xdist_group("real time")
+# Pages without a flight run beside flights in real time, with less of the processor.
 BESIDE = ("nice", "-n", "5")
 READER_S = 3.0  # a reader watches the vehicle after an order; `identify` needs 5 s of flight
 TIMEOUTS = ["COM_OF_LOSS_T", "GUID_TIMEOUT"]
@@ -131,14 +129,7 @@ def test_the_tables_name_commands_of_the_manual() -> None:
 
 
 @pytest.mark.manual
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(page, marks=[IN_REAL_TIME] if any(line.startswith("uavctl fly ") for line in commands) else [])
-        for page, commands in COMMANDS.items()
-        if commands
-    ],
-)
+@pytest.mark.parametrize("page", [page for page, commands in COMMANDS.items() if commands])
 def test_the_commands_of_a_page_succeed(page: str, shell: ManualShell, flown: Path) -> None:
     shell.prefix = (*BESIDE, *shell.prefix)
     shutil.copytree(flown, shell.folder, dirs_exist_ok=True)
@@ -183,7 +174,6 @@ AUTOPILOTS = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760
 
 
 @pytest.mark.manual
-@IN_REAL_TIME
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShell) -> None:
     def on_page(section: str) -> list[str]:
@@ -226,7 +216,6 @@ def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShel
 
 
 @pytest.mark.manual
-@IN_REAL_TIME
 def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
     page = "docs/fleet.md"
     sim, four = find_commands(page, "Try it")
@@ -249,7 +238,6 @@ def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
 
 
 @pytest.mark.manual
-@IN_REAL_TIME
 def test_the_radio_of_the_page_sends_to_four_vehicles(shell: ManualShell) -> None:
     _, sim = find_commands("docs/fleet.md", "Try it")
     (cameras,) = find_commands("docs/fleet.md", "One radio")
@@ -261,7 +249,6 @@ def test_the_radio_of_the_page_sends_to_four_vehicles(shell: ManualShell) -> Non
 
 
 @pytest.mark.manual
-@IN_REAL_TIME
 def test_the_orders_of_the_page_succeed(shell: ManualShell) -> None:
     shell.wait_for_text(shell.start(f"uavctl sim --config room-px4 {LONG_TIMEOUT}"), "system_id")
     accepted = f"--set 'check.accept={json.dumps(TIMED_ITEMS + TIMEOUTS)}'"

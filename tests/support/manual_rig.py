@@ -18,6 +18,8 @@ from pathlib import Path
 from patience import wait_until
 from places import ROOT
 
+from uavctl.daemon.runtime_folder import TEMPORARY
+
 PAGES = ("README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
 _BLOCK = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.M | re.S)
 _TABLE = re.compile(r"^\[(\w+)\]\n((?:(?!^\[).*\n?)*)", re.M)
@@ -116,17 +118,25 @@ class ManualShell:
         process.wait(LIMIT_S)
 
 
+# Two vehicles at one port of two networks are two vehicles, so the lock files below /tmp are separate, too.
+_SEPARATE = """
+ip link set lo up && mkdir -p -m 700 "$0" && mount -t tmpfs -o mode=700 none "$0" && echo up && exec sleep infinity
+"""
+
+
 @contextmanager
-def _network() -> Iterator[tuple[str, ...]]:
-    """Yield a command prefix for a network of its own; without the right to one, lock the default ports."""
+def _network(folder: Path) -> Iterator[tuple[str, ...]]:
+    """Yield a command prefix for a network and vehicle locks of its own; without the right, lock the default ports."""
+    locks = TEMPORARY / f"uavctl-{os.geteuid()}"
     holder = subprocess.Popen(
-        ["unshare", "-n", "sh", "-c", "ip link set lo up && echo up && exec sleep infinity"], stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL, text=True,
+        ["unshare", "-n", "-m", "sh", "-c", _SEPARATE, str(locks)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        text=True,
     )  # fmt: skip
     try:
         assert holder.stdout is not None
         if holder.stdout.readline() == "up\n":
-            yield ("nsenter", f"--net=/proc/{holder.pid}/ns/net")
+            spaces = [f"--{kind}=/proc/{holder.pid}/ns/{file}" for kind, file in (("net", "net"), ("mount", "mnt"))]
+            yield ("nsenter", *spaces, f"--wdns={folder}")
             return
         with (Path(tempfile.gettempdir()) / "uavctl-default-ports.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -145,7 +155,7 @@ def open_shell(folder: Path) -> Iterator[ManualShell]:
         (folder / name).symlink_to(ROOT / name)
     for example in ("duo.toml", "radio.toml", "cross.toml"):
         (folder / example).write_bytes((ROOT / "docs/examples" / example).read_bytes())
-    with tempfile.TemporaryDirectory(prefix="uavctl-") as short, _network() as network:  # sockets want short names
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as short, _network(folder) as network:  # short for sockets
         (Path(short) / "bin").mkdir()
         (Path(short) / "bin/uavctl").write_text(f'#!/bin/sh\nexec {sys.executable} -m uavctl "$@"\n')
         (Path(short) / "bin/uavctl").chmod(0o755)
