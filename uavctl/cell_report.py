@@ -3,7 +3,8 @@
 1. By plans, it moves along its plan: inside of a cell, or at rest until it gets one.
 2. On the ground, and in its own climb or landing, it moves along a column: up to the height of the climb that was
    ordered, or down to the floor.
-3. Braking and holding, it is free, with what may drive it. With its pilot or a failsafe, only its limits count.
+3. Braking and holding, it is free, with what may drive it; in a column for a landing from rest. With its pilot or a
+   failsafe, only its limits count.
 4. After its landing it does not move, also once no report comes any more.
 """
 
@@ -13,9 +14,10 @@ import numpy as np
 
 from uavctl.arrays import Array
 from uavctl.fleet.cell import NO_CELL, PlannedPath, Report, format_report
-from uavctl.flight.cells import CellRows, locate_plan
+from uavctl.flight.cells import AT_REST_MPS, CellRows, locate_plan
 from uavctl.flight.context import read_position, read_velocity
 from uavctl.flight.controller import Controller
+from uavctl.flight.fallback import FallbackReason
 from uavctl.flight.mission import find_target
 from uavctl.flight.state import ControlState
 from uavctl.mavlink.handover_states import HandoverState
@@ -28,14 +30,18 @@ GROUND_M = 0.1  # half height of a vehicle on the ground
 # Acceleration that a vehicle without plans may have for a while: gusts of 3 m/s, and the error of its model
 DRIFT_MPS2 = 0.5
 
+LANDING_MPS = 2.0 * AT_REST_MPS  # a vehicle that was at rest, and is faster, has left its column
+
 _BEFORE_FLIGHT = (HandoverState.WAITING, HandoverState.READY, HandoverState.MODE, HandoverState.ARMING)
 _CLIMB = (HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING)
 _LANDING = (HandoverState.LANDING, HandoverState.SETTLING)
 _END = (HandoverState.DONE, HandoverState.FAILED)
 
 
-def find_conduct(handover: HandoverState, vehicle: VehicleStatus | None, state: ControlState) -> Conduct:
-    """Find how a vehicle moves."""
+def find_conduct(
+    handover: HandoverState, vehicle: VehicleStatus | None, state: ControlState, speed_mps: float
+) -> Conduct:
+    """Find how a vehicle moves, which has an estimated speed."""
     is_on_ground = _is_on_ground(vehicle)
     if handover in (*_CLIMB, *_LANDING):
         return Conduct.PATH
@@ -43,7 +49,9 @@ def find_conduct(handover: HandoverState, vehicle: VehicleStatus | None, state: 
         return Conduct.PATH
     if handover is HandoverState.ENGAGED and state.mode is ControlMode.TRACK:
         return Conduct.REST if state.cells.choice.cell is None else Conduct.CELL
-    return Conduct.FREE
+    fallback = state.fallback.flown
+    is_landing = fallback is not None and fallback.reason >= FallbackReason.STOP and not fallback.is_over
+    return Conduct.PATH if is_landing and speed_mps <= LANDING_MPS else Conduct.FREE
 
 
 def has_landed(handover: HandoverState, vehicle: VehicleStatus | None) -> bool:
@@ -122,7 +130,7 @@ def _make_column(
     high_m = low_m = float(position_m[2])  # down is positive
     if conduct is Conduct.PATH and handover in (*_BEFORE_FLIGHT, *_CLIMB):
         high_m, low_m = min(high_m, floor_m - climb_m), max(low_m, floor_m)
-    elif conduct is Conduct.PATH and handover in _LANDING:
+    elif conduct is Conduct.PATH:
         low_m = max(low_m, floor_m)
     middle_m = np.array([position_m[0], position_m[1], 0.5 * (high_m + low_m)])
     half_m = np.array([COLUMN_M, COLUMN_M, 0.5 * (low_m - high_m) + GROUND_M])

@@ -11,6 +11,7 @@ fails, or whole ticks do, a landing request of its own is sent until it is answe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from traceback import extract_tb
 
@@ -24,6 +25,7 @@ from uavctl.config import Config
 from uavctl.errors import TickOverdueError, in_words
 from uavctl.event_codes import EventCode
 from uavctl.fleet.cell import NO_CELL, CellChoice, parse_cell
+from uavctl.flight.context import read_velocity
 from uavctl.flight.controller import Controller
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
@@ -512,7 +514,8 @@ class ControlLoop:
         return NO_CELL if cell is None else cell.number, self._find_conduct()
 
     def _find_conduct(self) -> Conduct:
-        return find_conduct(self.handover_state, self._vehicle, self._state)
+        speed_mps = math.hypot(*read_velocity(self._estimate, self._controller.plant))
+        return find_conduct(self.handover_state, self._vehicle, self._state, speed_mps)
 
     @property
     def outside(self) -> str:

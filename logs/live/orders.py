@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Literal
 
@@ -54,11 +54,10 @@ class OrderSender:
 
     Args:
         sockets: Path of the control socket by name of the vehicle; empty where no orders are taken.
-        rest_s: Time to come to rest before several vehicles land: a vehicle in a cell that brakes leaves it.
     """
 
-    def __init__(self, sockets: Mapping[str, str], rest_s: float = 0.0) -> None:
-        self._sockets, self._rest_s, self._waiting = sockets, rest_s, 0
+    def __init__(self, sockets: Mapping[str, str]) -> None:
+        self._sockets, self._waiting = sockets, 0
 
     @property
     def vehicles(self) -> list[str]:
@@ -79,17 +78,12 @@ class OrderSender:
             raise RequestRefusedError(HTTPStatus.SERVICE_UNAVAILABLE, "earlier orders still wait for their answers")
         self._waiting += 1
         try:
-            if self._rest_s and order.order == "land" and len(order.vehicles) > 1:
-                hold = _DaemonRequest("hold")
-                await asyncio.gather(asyncio.sleep(self._rest_s), self._ask(order.vehicles, hold))
-            replies = await self._ask(order.vehicles, _DaemonRequest(order.order, order.position_m))
+            request = _DaemonRequest(order.order, order.position_m)
+            paths = [self._sockets[name] for name in order.vehicles]
+            replies = await asyncio.gather(*(_ask_daemon(path, request) for path in paths))
         finally:
             self._waiting -= 1
         return [OrderAnswer(name, reply.ok, reply.text) for name, reply in zip(order.vehicles, replies, strict=True)]
-
-    async def _ask(self, names: Sequence[str], request: _DaemonRequest) -> list[_Reply]:
-        """Send a request to the daemons of vehicles at once; return their replies."""
-        return await asyncio.gather(*(_ask_daemon(self._sockets[name], request) for name in names))
 
     def _read_order(self, body: bytes) -> PageOrder:
         """Decode an order, and check that its vehicles may get it."""

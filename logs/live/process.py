@@ -50,7 +50,6 @@ class LiveProcess(FeedProcess):
     Args:
         port: TCP port; 0 takes one that is free.
         sockets: Control socket by name of the vehicle, for pages with the token; empty: no orders are taken.
-        rest_s: Time to come to rest before several vehicles land.
 
     Attributes:
         port: Port that is served.
@@ -63,10 +62,8 @@ class LiveProcess(FeedProcess):
 
     name = "live view"
 
-    def __init__(
-        self, port: int, on_death: Callable[[str], None], sockets: Mapping[str, Path] | None = None, rest_s: float = 0.0
-    ) -> None:
-        self.token, self.port, self._rest_s = secrets.token_urlsafe(12), port, rest_s
+    def __init__(self, port: int, on_death: Callable[[str], None], sockets: Mapping[str, Path] | None = None) -> None:
+        self.token, self.port = secrets.token_urlsafe(12), port
         self.order_token = secrets.token_urlsafe(16)
         self._sockets = {name: str(path) for name, path in (sockets or {}).items()}
         super().__init__(on_death)
@@ -84,4 +81,4 @@ class LiveProcess(FeedProcess):
 
     def _list_first_words(self) -> list[bytes]:
         # Other users can read the arguments of a process
-        return [msgspec.json.encode(LiveAccess(self.token, self.order_token, self._sockets, self._rest_s))]
+        return [msgspec.json.encode(LiveAccess(self.token, self.order_token, self._sockets))]

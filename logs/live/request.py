@@ -33,7 +33,6 @@ class LiveAccess(msgspec.Struct, frozen=True):
     view_token: str  # path by which pages of other sites may open the WebSocket
     order_token: str = ""  # of pages that may give orders
     sockets: dict[str, str] = {}  # path of the control socket by name of the vehicle; empty: no orders are taken
-    rest_s: float = 0.0  # see `OrderSender`
 
 
 @dataclass(frozen=True)

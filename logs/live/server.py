@@ -54,7 +54,7 @@ class LiveServer:
 
     def __init__(self, get_scene: Callable[[], bytes], get_history: Callable[[], bytes], access: LiveAccess) -> None:
         self._get_scene, self._get_history, self._access = get_scene, get_history, access
-        self._orders = OrderSender(access.sockets, access.rest_s)
+        self._orders = OrderSender(access.sockets)
         self._channels: dict[str, int] = {}  # number by topic, from 1
         self._definitions: list[Definition] = []
         self._subscribers: dict[Subscriber, asyncio.Event] = {}

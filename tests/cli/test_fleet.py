@@ -11,11 +11,11 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -42,7 +42,6 @@ from uavctl.daemon.cell_exchange import CellExchange
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest, make_socket_path
 from uavctl.errors import ConfigError, NotReachedError
 from uavctl.records import Truth
-from uavctl.wiring.cells import Coordinator, build_cell_parameters
 from uavctl.wiring.link import build_ages
 
 SPACING_M = 0.5
@@ -202,21 +201,16 @@ def test_without_daemons_status_and_land_fail(fleet_file: Path, capsys: pytest.C
     assert "west: land not reached" in output and "east: land not reached" in output
 
 
-@pytest.mark.parametrize(
-    ("head", "asked"), [("spacing_m = 0.5", ["land"]), (f"distance_m = {SPACING_M}", ["hold", "land"])]
-)
-def test_in_cells_all_come_to_rest_before_they_land(
-    head: str, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_daemon_that_hangs_delays_no_landing_and_ctrl_c_leaves_none_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    boxes = (WEST, EAST) if head.startswith("spacing") else ((-2.5, 2.5), (-2.5, 2.5))
     path = tmp_path / "fleet.toml"
     places_m = ("target.position_m=[0,-1,-1.2]", "target.position_m=[0,1,-1.2]")
     entries = [
         make_entry(name, box, f"udpin://127.0.0.1:{24541 + i}", "udpin://127.0.0.1:0", places_m[i])
-        for i, (name, box) in enumerate(zip("ab", boxes, strict=True))
+        for i, (name, box) in enumerate(zip("ab", (WEST, EAST), strict=True))
     ]
-    path.write_text(f"{head}\n" + "".join(entries))
-    monkeypatch.setattr("uavctl.cli.fleet.REST_S", 0.0)
+    path.write_text("spacing_m = 0.5\n" + "".join(entries))
     with tempfile.TemporaryDirectory() as short, ExitStack() as stack:  # sockets want short names
         monkeypatch.setenv(FOLDER_VARIABLE, short)
         daemons = []
@@ -224,12 +218,10 @@ def test_in_cells_all_come_to_rest_before_they_land(
             daemons.append(FakeDaemon(make_socket_path(Path(short), member.daemon), answer(ok=True, text="landing")))
             stack.callback(daemons[-1].close)
         daemons[0].may_answer.clear()
-        first: list[str] = []
 
         def interrupt_and_answer() -> None:
             wait_until(lambda: all(daemon.requests for daemon in daemons), "one that hangs delays no other")
-            first.extend(daemon.requests[0].ask for daemon in daemons)
-            os.kill(os.getpid(), signal.SIGINT)  # Ctrl-C leaves none without the order
+            os.kill(os.getpid(), signal.SIGINT)
             daemons[0].may_answer.set()
 
         helper = threading.Thread(target=interrupt_and_answer)
@@ -239,8 +231,7 @@ def test_in_cells_all_come_to_rest_before_they_land(
         except KeyboardInterrupt:
             pytest.fail("Ctrl-C ended the command")
         helper.join(LIMIT_S)
-        assert first == [asked[0]] * 2
-        assert [[request.ask for request in daemon.requests] for daemon in daemons] == [asked] * 2
+        assert [[request.ask for request in daemon.requests] for daemon in daemons] == [["land"]] * 2
 
 
 RADIO = "[radio]\nbytes_per_s = 5760\nrate_hz = 50\nloss = 0.3\n"
@@ -336,25 +327,18 @@ class NotedFlight(FleetFlight):
 
 
 @pytest.mark.parametrize(
-    ("failure", "problem", "lands_at_once"), [("failed", "", False), ("", "too near", True), ("", "", True)]
+    ("reason", "failure", "problem"), [("ordered", "", ""), ("", "failed", ""), ("", "", "too near")]
 )
-def test_without_a_coordinator_vehicles_have_time_to_rest_before_they_land(
-    failure: str, problem: str, lands_at_once: bool, monkeypatch: pytest.MonkeyPatch
+def test_all_flights_end_for_the_first_reason_also_without_a_coordinator(
+    reason: str, failure: str, problem: str
 ) -> None:
-    """The newest reports of a coordinator that failed are old: vehicles at rest in them may move."""
     flight = NotedFlight(make_member(WEST, EAST), ())
-    config = load_config("room-px4", ["mission.cells=true"])
-    coordinator = Coordinator(build_cell_parameters([config], SPACING_M), 1)
-    exchange = CellExchange(coordinator, (), lambda _: None, pytest.fail)
-    assert exchange.is_at_rest
-    coordination = Coordination(exchange)
-    coordination.failure, exchange.problem = failure, problem
+    coordination = Coordination(cast(CellExchange, SimpleNamespace(problem="")))
     end = FleetEnd([flight], coordination)
-    monkeypatch.setattr("uavctl.cli.fleet.REST_S", 1e9)
-    end.update("ordered")
-    assert flight.is_requested is lands_at_once
-    monkeypatch.setattr("uavctl.cli.fleet.REST_S", 0.0)
     end.update("")
+    assert not flight.is_requested
+    coordination.failure, coordination.exchange.problem = failure, problem
+    end.update(reason)
     assert flight.is_requested
 
 
@@ -372,52 +356,6 @@ def test_a_daemon_ends_when_the_fleet_orders_it_is_killed_or_stands_still() -> N
         os.close(reader)
         if not closes:
             os.close(writer)
-
-
-class TimedFlight:
-    """A daemon that runs until its end is requested."""
-
-    flown: ClassVar[list[TimedFlight]] = []
-
-    def __init__(self, member: Member, options: Sequence[str]) -> None:
-        self.member, self.options, self.exit_code, self.is_requested = member, options, 0, False
-        self.flown.append(self)
-
-    def start(self) -> None: ...
-
-    def join_output(self) -> None: ...
-
-    def tell_running(self) -> None: ...
-
-    def is_running(self) -> bool:
-        return not self.is_requested and "--duration" not in self.options
-
-    def request_fallback(self) -> None:
-        self.is_requested = True
-
-
-@pytest.mark.parametrize("head", [HEAD, CELLS], ids=["boxes", "cells"])
-def test_in_cells_the_fleet_ends_all_flights_together_when_the_time_is_over(
-    head: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, held = tmp_path / "fleet.toml", list[bool]()
-    rooms = (WEST, EAST) if head == HEAD else (ROOM, ROOM)
-    goals = [f"target.position_m=[0.5,{east_m},-1.2]" for east_m in (-1.0, 1.0)]
-    entries = [make_entry(f"v{i}", rooms[i], (A, B)[i], "udpin://127.0.0.1:0", goals[i]) for i in (0, 1)]
-    path.write_text(head + "".join(entries))
-    exchange = SimpleNamespace(problem="", is_at_rest=True, hold=lambda: held.append(True))
-    monkeypatch.setattr("uavctl.cli.fleet.FleetFlight", TimedFlight)
-    monkeypatch.setattr("uavctl.cli.fleet._show_status", lambda _: nullcontext({}))
-    monkeypatch.setattr("uavctl.cli.fleet._draw_page", lambda _: None)
-    monkeypatch.setattr(
-        "uavctl.cli.fleet.coordinate", lambda *_: nullcontext(Coordination(cast(CellExchange, exchange)))
-    )
-    TimedFlight.flown.clear()
-    assert run(["fleet", "fly", str(path), "--duration", "0.2", "--out", str(tmp_path / "out")]) == 0
-    in_cells = head == CELLS
-    assert ["--duration" in flight.options for flight in TimedFlight.flown] == [not in_cells] * 2
-    assert [flight.is_requested for flight in TimedFlight.flown] == [in_cells] * 2
-    assert bool(held) is in_cells
 
 
 @contextmanager

@@ -207,28 +207,12 @@ def test_a_daemon_that_is_gone_is_reached_again(rig: Rig) -> None:
     assert len(rig.flights[1].taken) >= taken + 10
 
 
-def test_to_hold_the_goals_are_the_ends_of_the_plans(rig: Rig) -> None:
-    goal_m = np.array([0.0, 1.0, -1.0])
-    flight = rig.flights[0]
-    rest_m, flight.place_m = flight.place_m.copy(), goal_m
-    rig.run(10)
-    assert flight.taken[-1].goal_m == pytest.approx(tuple(goal_m))
-    flight.place_m = rest_m
-    rig.exchange.hold()
-    rig.run(10)
-    flight.place_m = goal_m  # the mission's goal counts no more
-    rig.run(10)
-    state = rig.coordinator.state
-    assert state is not None and state.goals_m[0] == pytest.approx(rest_m)
-
-
 def test_a_report_of_another_horizon_is_told_and_not_used(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     rig.run(10)
     short = PlannedPath(0, np.zeros((3, 3)), np.zeros((3, 3)))
     monkeypatch.setattr(rig.flights[0], "_make_path", lambda: short)
     rig.run(10)
     assert len(rig.notes) == 1 and "v0" in rig.notes[0]
-    assert rig.exchange.is_at_rest
 
 
 def test_a_connection_has_one_open_request_and_survives_other_programs(folder: Path) -> None:

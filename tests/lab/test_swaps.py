@@ -9,11 +9,13 @@ import pytest
 from logs.recording.export import read_table
 from uavctl.cli.replays import replay_flight
 from uavctl.fleet.cell import MovingCell, format_cell
-from uavctl.lab.swaps import MAX_DELAY_NS, Swap, SwapCase, fly_swap, make_circle, measure_distances
-from uavctl.records import Conduct
+from uavctl.flight.cells import AT_REST_MPS
+from uavctl.lab.swaps import MAX_DELAY_NS, NEAR_M, Swap, SwapCase, fly_swap, make_circle, measure_distances
+from uavctl.records import Command, Conduct, Order
 
 MAX_RISK = 0.05  # 1 - δ_x of the presets
 SLACK_TOLERANCE = 1e-3  # sum of the slacks of a plan [m] that is rounding of its program
+GUST_M = 0.15  # as far as a gust moves a vehicle that brakes
 CONTACT = 0.14 / 0.5  # distance of two spheres of 0.07 m that touch, over d
 
 
@@ -35,6 +37,53 @@ def test_two_vehicles_face_to_face_pass_and_their_recordings_replay(tmp_path: Pa
         slack = read_table(tmp_path / f"vehicle-{number}" / "flight.mcap", "/uavctl/plan")["slack"].to_numpy()
         assert (slack > SLACK_TOLERANCE).mean() < 0.2
     assert result.outside_share <= MAX_RISK
+
+
+@pytest.mark.parametrize(
+    ("case", "all_land"),
+    [
+        (SwapCase(2, 11, limit_s=12.0), False),
+        pytest.param(SwapCase(4, 12, limit_s=20.0), False, marks=pytest.mark.slow),
+        pytest.param(SwapCase(4, 13, "ardupilot", limit_s=20.0), False, marks=pytest.mark.slow),
+        pytest.param(SwapCase(4, 14, limit_s=20.0), True, marks=pytest.mark.slow),
+    ],
+    ids=["one of 2", "one of 4", "one of 4, ardupilot", "4 of 4"],
+)
+def test_a_vehicle_that_lands_in_flight_first_rests_in_its_cell_and_lands_no_other(
+    case: SwapCase, all_land: bool, tmp_path: Path
+) -> None:
+    """Braking at once, it left its cell at up to 1.4 m/s, and all others landed."""
+    swap = make_swap(case, tmp_path)
+    landing = swap.fleet.loops if all_land else swap.fleet.loops[:1]
+    ordered_mps: list[float] = []
+    last_cells: dict[int, MovingCell] = {}
+    exits: dict[int, tuple[float, float]] = {}  # speed, and distance outside of the last cell
+
+    def watch(flown_s: float) -> bool:
+        if not ordered_mps and flown_s >= 2.0:
+            ordered_mps.append(float(np.linalg.norm(swap.fleet.truths[0].velocity_mps)))
+            assert all(loop.order(Command(order=Order.LAND)) for loop in landing)
+        for i, loop in enumerate(landing):
+            cell = loop.cell_choice.cell
+            if cell is not None:
+                last_cells[i] = cell
+            elif i in last_cells and i not in exits:
+                truth, last = swap.fleet.truths[i], last_cells[i]
+                outside_m = np.maximum(last.lower_m[-1] - truth.position_m, truth.position_m - last.upper_m[-1])
+                exits[i] = float(np.linalg.norm(truth.velocity_mps)), float(outside_m.max())
+        return True
+
+    result = swap.fly(watch)
+    assert ordered_mps[0] > 0.4
+    assert len(exits) == len(landing)
+    assert max(speed_mps for speed_mps, _ in exits.values()) < 2.0 * AT_REST_MPS
+    assert max(outside_m for _, outside_m in exits.values()) < GUST_M
+    assert result.landings == 0
+    assert result.collisions == 0
+    assert result.closest >= 1.0
+    positions_m = swap.positions_m
+    assert (np.linalg.norm(positions_m - swap.goals_m, axis=1)[len(landing) :] < NEAR_M).all()
+    assert (positions_m[: len(landing), 2] > -0.2).all()
 
 
 @pytest.mark.long

@@ -53,14 +53,12 @@ def answer(*, ok: bool, text: str) -> bytes:
 
 
 @contextmanager
-def serve_orders(
-    folder: Path, replies: dict[str, bytes], rest_s: float = 0.0
-) -> Iterator[tuple[LiveProcess, dict[str, FakeDaemon]]]:
+def serve_orders(folder: Path, replies: dict[str, bytes]) -> Iterator[tuple[LiveProcess, dict[str, FakeDaemon]]]:
     with ExitStack() as stack:
         daemons = {}
         for name, reply in replies.items():
             daemons[name] = FakeDaemon(folder / f"{name}.sock", reply)
             stack.callback(daemons[name].close)
-        live = LiveProcess(0, print, {name: folder / f"{name}.sock" for name in replies}, rest_s)
+        live = LiveProcess(0, print, {name: folder / f"{name}.sock" for name in replies})
         stack.callback(live.close)
         yield live, daemons

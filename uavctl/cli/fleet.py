@@ -57,7 +57,6 @@ from uavctl.wiring.radio import RadioConfig, RadioLoad, compute_loads, compute_s
 STATUS_PERIOD_S = 0.5  # between two requests for the status of all vehicles
 POLL_S = 0.1  # between two checks of their processes
 TABLE_PERIOD_S = 5.0  # between two tables where there is no terminal
-REST_S = 3.0  # longest time to come to rest in cells before the landing: a plan is 2.4 s long
 RUNS, ORDERED = b".", b"x"  # to standard input of a daemon: the fleet's process runs; the end is ordered
 # Without news of the fleet's process a daemon ends its flight: longer than a computer stands still that is only busy
 STANDSTILL_S = 20.0
@@ -136,9 +135,7 @@ def fly(
     check_take_off(arm, takeoff)
     view_port = choose_live_port(live=live, port=live_port)
     fleet = read_fleet(file)
-    # In cells one that brakes alone would leave its cell: all end together
-    lasts_alone = duration is not None and fleet.cells is None
-    options = ["--duration", str(duration)] if lasts_alone else []
+    options = [] if duration is None else ["--duration", str(duration)]
     options += ["--arm", "--takeoff", str(takeoff)] if takeoff is not None else []
     ports = [] if view_port is None else choose_ports(len(fleet.members))
     flights = [
@@ -156,11 +153,9 @@ def fly(
             coordination = stack.enter_context(coordinate(fleet, fleet.cells, out / COORDINATOR_FILE))
         for flight in flights:
             flight.start()
-        end, begun_s = FleetEnd(flights, coordination), time.monotonic()
+        end = FleetEnd(flights, coordination)
         while any(flight.is_running() for flight in flights):
-            is_time_over = duration is not None and not lasts_alone and time.monotonic() - begun_s >= duration
-            reason = "ordered" if stopped() else "the time is over" if is_time_over else ""
-            end.update(reason or _find_failure(flights, health))
+            end.update("ordered" if stopped() else _find_failure(flights, health))
             for flight in flights:
                 flight.tell_running()
             time.sleep(POLL_S)
@@ -194,11 +189,7 @@ def status(
 def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None) -> int:
     """Land all vehicles of a file; those in cells first come to rest. Exit code 1: not all of them take the order."""
     fleet, folder, all_accepted = read_fleet(file), find_control_folder(control), True
-    with stop_on_signals():  # Ctrl-C while they come to rest leaves none without the order to land
-        if fleet.cells is not None:  # a vehicle that brakes leaves its cell
-            print_message(f"all vehicles come to rest in their cells for {REST_S:g} s", highlight=False)
-            _ask_all(fleet.members, folder, "hold")
-            time.sleep(REST_S)
+    with stop_on_signals():  # Ctrl-C leaves none without the order to land
         replies = _ask_all(fleet.members, folder, "land")
     for member, reply in zip(fleet.members, replies, strict=True):
         if isinstance(reply, NotReachedError):
@@ -237,8 +228,7 @@ def _open_page(
         )
         for flight, port in zip(flights, ports, strict=True)
     ]
-    in_cells = any(flight.member.config.mission.cells for flight in flights)
-    with show_fleet_page(title, live_port, vehicles, REST_S if in_cells else 0.0):
+    with show_fleet_page(title, live_port, vehicles):
         yield
 
 
@@ -264,8 +254,7 @@ class FleetFlight:
 
     def __init__(self, member: Member, options: Sequence[str]) -> None:
         self.member = member
-        rest_s = REST_S if member.config.mission.cells else 0.0
-        daemon_code = f"from uavctl.cli.fleet import run_fleet_daemon; run_fleet_daemon({rest_s})"
+        daemon_code = "from uavctl.cli.fleet import run_fleet_daemon; run_fleet_daemon()"
         self._command = [sys.executable, "-P", "-c", daemon_code, "fly", *member.options, *options]
         self._process: subprocess.Popen[str] | None = None
         self._output_thread = threading.Thread(target=self._print_output, name=member.name, daemon=True)
@@ -326,38 +315,22 @@ class FleetFlight:
 
 
 class FleetEnd:
-    """The end of all flights, for the first reason that there is.
-
-    Vehicles in cells first come to rest. Braking would leave the cells, and two that fly to each other would meet.
-    """
+    """The end of all flights, for the first reason that there is."""
 
     def __init__(self, flights: Sequence[FleetFlight], coordination: Coordination | None) -> None:
         self._flights, self._coordination = flights, coordination
-        self._begun_s: float | None = None
         self._is_requested = False
 
     def update(self, reason: str) -> None:
-        """Begin the end if there is a reason, and request the landings once they are due."""
+        """Request the end of all flights once there is a reason."""
         if self._coordination is not None:
             reason = reason or self._coordination.problem
-        if self._begun_s is None and reason:
-            self._begun_s = time.monotonic()
-            print_message(f"{reason}: all vehicles end their flights", highlight=False)
-            if self._coordination is not None:
-                self._coordination.exchange.hold()
-        if self._begun_s is None or self._is_requested or not self._may_land(self._begun_s):
+        if self._is_requested or not reason:
             return
         self._is_requested = True
+        print_message(f"{reason}: all vehicles end their flights", highlight=False)
         for flight in self._flights:
             flight.request_fallback()
-
-    def _may_land(self, begun_s: float) -> bool:
-        coordination = self._coordination
-        if coordination is None or coordination.exchange.problem:  # nobody has taken off
-            return True
-        if not coordination.failure and coordination.exchange.is_at_rest:  # after a failure its reports are old
-            return True
-        return time.monotonic() - begun_s >= REST_S
 
 
 class Coordination:
@@ -430,16 +403,11 @@ def wait_for_end(descriptor: int, standstill_s: float) -> Literal["ordered", "ki
     return "stands still"
 
 
-def run_fleet_daemon(rest_s: float) -> None:
-    """Run the command line as a daemon of a fleet; raise Ctrl-C once the fleet's process orders the end, or is gone.
-
-    Args:
-        rest_s: Time to come to rest in the last cell if the process is gone [s]; braking leaves a cell.
-    """
+def run_fleet_daemon() -> None:
+    """Run the command line as a daemon of a fleet; raise Ctrl-C once the fleet's process orders the end, or is gone."""
 
     def end() -> None:
-        if wait_for_end(0, STANDSTILL_S) != "ordered":
-            time.sleep(rest_s)
+        wait_for_end(0, STANDSTILL_S)
         signal.raise_signal(signal.SIGINT)
 
     try:
@@ -498,9 +466,7 @@ def _show_status(flights: Sequence[FleetFlight]) -> Iterator[HealthByName]:
         thread.join(TABLE_PERIOD_S)
 
 
-def _ask_all(
-    members: Sequence[Member], folder: Path, ask: Literal["hold", "land", "status"]
-) -> list[Reply | NotReachedError]:
+def _ask_all(members: Sequence[Member], folder: Path, ask: Literal["land", "status"]) -> list[Reply | NotReachedError]:
     """Ask all daemons at once: one that hangs delays no other."""
 
     def send(member: Member) -> Reply | NotReachedError:

@@ -55,14 +55,11 @@ def choose_ports(count: int) -> list[int]:
 
 
 @contextmanager
-def show_fleet_page(
-    title: str, live_port: int, vehicles: Sequence[ShownVehicle], rest_s: float = 0.0
-) -> Iterator[None]:
+def show_fleet_page(title: str, live_port: int, vehicles: Sequence[ShownVehicle]) -> Iterator[None]:
     """Serve one page with all vehicles.
 
     Args:
         live_port: TCP port of the page; 0: any free one.
-        rest_s: Time to come to rest before the page lands several of them.
 
     Raises:
         UsageError: The page cannot be served.
@@ -71,7 +68,7 @@ def show_fleet_page(
     from logs.live.process import LiveProcess
 
     sockets = {vehicle.name: vehicle.socket for vehicle in vehicles}
-    live, done = LiveProcess(live_port, report_dead_view, sockets, rest_s), threading.Event()
+    live, done = LiveProcess(live_port, report_dead_view, sockets), threading.Event()
     readers = [SceneReader(vehicle.port) for vehicle in vehicles]
     rows = list(zip(vehicles, readers, strict=True))
     thread = threading.Thread(target=_feed_page, args=(live, title, rows, done), name="live page", daemon=True)

@@ -24,7 +24,6 @@ from uavctl.wiring.cells import CYCLE_NS, Coordinator
 
 STALL_NS = 300_000_000  # between two wakes: the process stood still
 SETTLE_STEPS = 3  # after that: a request waits for a tick, its reply for the next wake
-AT_REST_MPS = 0.15  # slower is at rest: the noise of an estimate, and a light gust
 _BLOCK_BYTES = 65_536
 _MAX_REPLY_BYTES = 2**20
 _REPLY = msgspec.json.Decoder(CellReply)
@@ -137,15 +136,6 @@ class CellExchange:
         self._not_before_ns = 0  # the next cycle
         self._dt_ns = round(coordinator.parameters.dt_s * 1e9)
         self.problem = ""
-
-    @property
-    def is_at_rest(self) -> bool:
-        """Whether no vehicle that flies by plans moves."""
-        return self._coordinator.is_at_rest(AT_REST_MPS)
-
-    def hold(self) -> None:
-        """Let all vehicles come to rest in their cells."""
-        self._coordinator.hold()
 
     def find_next_ns(self, now_ns: int) -> int:
         """Return the time of the next wake: the middle of a step."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from uavctl.config import Config
 from uavctl.errors import UsageError
+from uavctl.flight.cells import REST_NS
 from uavctl.flight.mission import RestRegion
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import LAND_PERIODS
@@ -140,6 +141,7 @@ def explain_height_refusal(region: RestRegion | None, take_off_m: float) -> str:
 
 
 def compute_stop_limit_s(config: Config, *, takes_off: bool) -> float:
-    """Return the time limit of a hand-over [s]; it includes the landing of an ordered or relayed flight."""
+    """Return the time limit of a hand-over [s], with rest in a cell and the landing of an ordered or relayed flight."""
     landings = 1 + LAND_PERIODS if takes_off else int(config.relay.enabled)
-    return config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s
+    rest_s = REST_NS * 1e-9 if config.mission.cells else 0.0
+    return rest_s + config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s

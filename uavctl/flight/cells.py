@@ -3,7 +3,8 @@
 1. The newest cell that came waits for the next plan. It is decided there: by the plan in progress, or by a new plan.
 2. A plan keeps the limits of the cell in use, and goes to its goal. Without a cell the vehicle stays where it came to
    rest.
-3. A vehicle that does not fly by plans leaves its cell.
+3. A vehicle that does not fly by plans leaves its cell. Braking would leave it in motion, and two that fly to each
+   other would meet. So an end that the operator orders waits until the vehicle is at rest in its cell.
 4. A report has the plan in progress at the steps of the common clock, on lines between the stages of the plan.
 """
 
@@ -21,6 +22,8 @@ from uavctl.fleet.cell import NO_CHOICE, CellChoice, MovingCell, PlannedPath, de
 from uavctl.records import CellDecision, Plan, Vector
 from uavctl.smpc.answer import Preview
 
+REST_NS = 3_000_000_000  # longest time to come to rest in a cell before the end: a plan is 2.4 s long
+AT_REST_MPS = 0.15  # slower is at rest: the noise of an estimate, and a light gust
 LANDING_NEAR_M = 0.3  # horizontal distance from the goal of a cell at which its vehicle lands
 
 

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from uavctl.arrays import sum_in_order
 from uavctl.fleet.cell import parse_cell
 from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias, remove_drag_from_bias
-from uavctl.flight.cells import add_cell, is_at_landing_place, leave_cells
+from uavctl.flight.cells import AT_REST_MPS, REST_NS, add_cell, is_at_landing_place, leave_cells
 from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
 from uavctl.flight.decided import Decided, PhaseData
 from uavctl.flight.estimator import make_estimate, select_covariance
@@ -43,7 +43,7 @@ from uavctl.flight.orders import Ordered
 from uavctl.flight.replan import replan
 from uavctl.flight.state import ControlState
 from uavctl.flight.supervise import RETURNED_NS, Supervised, are_positions_lost, observe_velocity
-from uavctl.records import ControlMode, Vec3, moves_now
+from uavctl.records import Command, ControlMode, Order, Vec3, moves_now
 from uavctl.smpc.plant import Plant
 
 MISSION_OVER = "the mission is over: landing"
@@ -71,7 +71,9 @@ def decide(state: ControlState, context: TickContext, supervised: Supervised, or
     draft = _apply_requests(phase, ordered)
     decided = _decide_handed_over(draft, phase) or _decide_fallback(draft, phase) or _decide_plan(draft, phase)
     if context.controller.cell_rows is not None and decided.mode is not ControlMode.TRACK:
-        return replace(decided, cells=leave_cells(decided.cells))
+        # Without a fallback that can end, others fly the vehicle
+        delayed = None if decided.fallback is None or decided.fallback.is_final else decided.delayed
+        return replace(decided, cells=leave_cells(decided.cells), delayed=delayed)
     return decided
 
 
@@ -89,6 +91,16 @@ def _apply_requests(phase: PhaseData, ordered: Ordered) -> Decided:
     jump_suspected = state.fallback.jump_suspected or (becomes_final and outliers is not None and outliers.is_likely)
     if phase.context.inputs.stop:
         fallback = request_fallback(fallback, FallbackReason.STOP, at_ns)
+    delayed, order = state.fallback.delayed, ordered.order
+    if delayed is not None:
+        fallback = request_fallback(fallback, delayed.reason, at_ns)
+    if fallback is not None and _rests_first(fallback, phase):
+        order = Command(order=Order.HOLD) if delayed is None else order
+        since_ns = at_ns if delayed is None else delayed.since_ns
+        delayed = Fallback(mode=fallback.mode, since_ns=since_ns, reason=fallback.reason)
+        fallback, is_final = state.fallback.flown, False
+    else:
+        delayed = None
     cells, message = state.cells, phase.context.inputs.cell
     if message is not None and phase.controller.cell_rows is not None:
         cells = add_cell(cells, parse_cell(message))
@@ -96,8 +108,9 @@ def _apply_requests(phase: PhaseData, ordered: Ordered) -> Decided:
         plan=state.plan.flown,
         superseded_after_ns=_find_superseded_after_ns(state, supervised),
         fallback=fallback,
+        delayed=delayed,
         mission=state.mission.progress,
-        order=ordered.order,
+        order=order,
         consecutive_samples=supervised.consecutive_samples,
         hold_point_m=state.fallback.hold_point_m,
         left_hold_ns=state.fallback.left_hold_ns,
@@ -106,6 +119,18 @@ def _apply_requests(phase: PhaseData, ordered: Ordered) -> Decided:
         fault=supervised.monitors.external.fault,
         cells=cells,
     )
+
+
+def _rests_first(fallback: Fallback, phase: PhaseData) -> bool:
+    """Whether a final fallback waits until the vehicle is at rest in its cell."""
+    state, context, view = phase.state, phase.context, phase.view
+    if fallback.reason not in (FallbackReason.STOP, FallbackReason.LAND) or context.mode is not ControlMode.TRACK:
+        return False
+    if state.cells.choice.cell is None or phase.supervised.fallback_reasons or context.not_ready_reason:
+        return False
+    speed_mps = math.hypot(*read_velocity(view.estimate, phase.controller.plant))
+    delayed = state.fallback.delayed
+    return speed_mps > AT_REST_MPS and (delayed is None or context.at_ns - delayed.since_ns < REST_NS)
 
 
 def _find_superseded_after_ns(state: ControlState, supervised: Supervised) -> int | None:

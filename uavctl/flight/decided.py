@@ -21,6 +21,7 @@ class Decided(msgspec.Struct, frozen=True, eq=False):
     plan: Plan | None
     superseded_after_ns: int | None  # a position that was captured after this time supersedes the plan
     fallback: Fallback | None
+    delayed: Fallback | None  # final fallback that waits until the vehicle is at rest in its cell
     mission: MissionState | None
     order: Command | None  # order that still waits for a plan
     consecutive_samples: int  # fresh samples in a row

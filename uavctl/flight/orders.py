@@ -34,11 +34,12 @@ class Ordered(msgspec.Struct, frozen=True, eq=False):
 def take_orders(state: ControlState, context: TickContext) -> Ordered:
     """Accept or refuse the orders of a tick."""
     ordered = Ordered(state.fallback.flown, state.mission.order, state.mission.progress)
+    is_ending = state.fallback.delayed is not None
     answers: list[Event] = []
     for command in context.inputs.commands:
         if command.order not in _OF_CORE:
             continue
-        reason = _find_refusal(ordered, command, context)
+        reason = _find_refusal(ordered, command, context, is_ending=is_ending)
         severity, code = (
             (Severity.WARNING, EventCode.ORDER_REFUSED) if reason else (Severity.INFO, EventCode.ORDER_ACCEPTED)
         )
@@ -75,15 +76,19 @@ def describe_order(command: Command) -> str:
     return f"{command.order.value} {_describe_position(command.position_m)}"
 
 
-def _find_refusal(ordered: Ordered, command: Command, context: TickContext) -> str:
-    """Return why an order is refused; empty if it is accepted."""
+def _find_refusal(ordered: Ordered, command: Command, context: TickContext, *, is_ending: bool) -> str:
+    """Return why an order is refused; empty if it is accepted.
+
+    Args:
+        is_ending: Whether the vehicle comes to rest in its cell for the end of the flight.
+    """
     fallback, mission = ordered.fallback, context.controller.mission
     if fallback is not None and fallback.is_over:
         return "the vehicle has been handed over"
     if command.order is Order.LAND:
         # A fallback flies on while the vehicle is silent, and lands when it is heard again.
         return "" if context.inputs.vehicle is None and fallback is not None else context.not_ready_reason
-    if fallback is not None and fallback.is_final:
+    if is_ending or (fallback is not None and fallback.is_final):
         return "the vehicle is landing"
     if command.order is Order.RESUME:
         left = ordered.mission is not None and ordered.mission.stay is not None

@@ -51,7 +51,9 @@ def replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, ph
         reason = "new cell: new plan"
     else:
         return replace(draft, reason="no new position: the plan continues")
-    if draft.order is not None:
+    if draft.delayed is not None:
+        reason = f"{reason}, to rest in the cell before the end"
+    elif draft.order is not None:
         reason = f"{reason}, as ordered: {describe_order(draft.order)}"
     mission = follow_order(controller.mission, mission, draft.order, base.mean, context.boundary_ns)
     if draft.fallback is not None and draft.fallback.mode is ControlMode.HOLD:
@@ -65,7 +67,8 @@ def replan(draft: Decided, mission: MissionState, base: Estimate, cov: Array, ph
     if controller.cell_rows is None:
         asked = _ask(base, target, preview, phase)
     else:
-        draft, asked = _plan_in_cell(draft, base, target if is_first else None, preview, phase)
+        is_own_target = is_first or draft.delayed is not None
+        draft, asked = _plan_in_cell(draft, base, target if is_own_target else None, preview, phase)
     draft = replace(draft, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
     if asked.plan is None:
         reason = "no new plan: the old plan continues"

@@ -94,6 +94,7 @@ class FallbackGroup(msgspec.Struct, frozen=True, eq=False):
     """State of the fallback."""
 
     flown: Fallback | None = None  # the fallback that flies; None if it does not
+    delayed: Fallback | None = None  # final one that waits until the vehicle is at rest in its cell; None: none does
     biases: Biases = ()  # recent estimates of the bias
     hold_point_m: Vec3 | None = None  # estimated position at which HOLD began [m]; None in other modes
     left_hold_ns: int | None = None  # boundary of the first plan after the last HOLD [ns]; None before

@@ -127,6 +127,7 @@ def _make_state(
         ),
         fallback=FallbackGroup(
             flown=decided.fallback,
+            delayed=decided.delayed,
             biases=decided.biases,
             hold_point_m=decided.hold_point_m,
             left_hold_ns=decided.left_hold_ns,

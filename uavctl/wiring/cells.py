@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from uavctl.fleet.coordinator import (
 )
 from uavctl.flight.cells import CellRows
 from uavctl.flight.limits import AXES
-from uavctl.records import CellMessage, CellReport, Conduct
+from uavctl.records import CellMessage, CellReport
 from uavctl.smpc.conditioned.design import AnyDesign
 from uavctl.smpc.plant import Plant
 
@@ -146,11 +145,6 @@ class Coordinator:
         self._newest: dict[int, Report] = {}  # newest report of each vehicle that has sent one
         self._received: dict[int, Report] = {}  # since the last cycle
         self._state: CoordinatorState | None = None
-        self._rests_m: dict[int, Array] | None = None  # places at which vehicles come to rest, see `hold`
-
-    def hold(self) -> None:
-        """Hold: from now on the goal of each vehicle is the place where its plan ends."""
-        self._rests_m = {} if self._rests_m is None else self._rests_m
 
     @property
     def parameters(self) -> CellParameters:
@@ -166,19 +160,13 @@ class Coordinator:
         """Find the pairs that would begin too near to each other, and the distance to place them at [m]."""
         return find_near_starts([self._newest[number] for number in range(self._vehicles)], self._parameters)
 
-    def is_at_rest(self, max_speed_mps: float) -> bool:
-        """Whether no vehicle that flies by plans is faster than a speed."""
-        reports = list(self._newest.values())  # another thread may add one meanwhile
-        flown = [report for report in reports if report.conduct in (Conduct.CELL, Conduct.REST)]
-        return all(float(np.linalg.norm(report.velocity_mps)) <= max_speed_mps for report in flown)
-
     def receive(self, number: int, message: CellReport) -> None:
         """Receive the report of a vehicle for the next cycle.
 
         Raises:
             ValueError: It is malformed.
         """
-        self._newest[number] = self._received[number] = self._read_report(number, message)
+        self._newest[number] = self._received[number] = self._read_report(message)
 
     @property
     def state(self) -> CoordinatorState | None:
@@ -209,11 +197,9 @@ class Coordinator:
         open_cells = zip(state.newest, state.is_decided, strict=True)
         return {number: format_cell(cell) for number, (cell, is_decided) in enumerate(open_cells) if not is_decided}
 
-    def _read_report(self, number: int, message: CellReport) -> Report:
-        """Read a report; to hold, its goal is the end of its plan."""
+    def _read_report(self, message: CellReport) -> Report:
+        """Read a report."""
         report = parse_report(message)
         if len(report.plan.mean_m) != self._parameters.stages:
             raise ValueError(f"a path has {len(report.plan.mean_m)} positions, not {self._parameters.stages}")
-        if self._rests_m is None:
-            return report
-        return replace(report, goal_m=self._rests_m.setdefault(number, report.plan.mean_m[-1]))
+        return report

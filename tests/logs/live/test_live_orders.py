@@ -57,15 +57,6 @@ def test_each_order_comes_to_its_daemon_and_its_answer_back(tmp_path: Path) -> N
     ]
 
 
-def test_several_vehicles_in_cells_come_to_rest_before_they_land(tmp_path: Path) -> None:
-    replies = {name: answer(ok=True, text="") for name in ("west", "east")}
-    with serve_orders(tmp_path, replies, rest_s=0.01) as (live, daemons):
-        assert [one["ok"] for one in give(live, "land", ["west", "east"])] == [True, True]
-        give(live, "land", ["west"])
-    assert daemons["west"].requests == [ControlRequest(ask=name) for name in ("hold", "land", "land")]
-    assert daemons["east"].requests == [ControlRequest(ask=name) for name in ("hold", "land")]
-
-
 @pytest.mark.fault(98)
 def test_98_what_is_no_order_of_the_page_reaches_no_daemon(tmp_path: Path) -> None:
     """No take-off, no cell, no unknown vehicle, and no goto to several."""

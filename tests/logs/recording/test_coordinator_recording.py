@@ -29,7 +29,7 @@ PARAMETERS = build_cell_parameters([CONFIG], 0.35)
 NAMES = ("east", "west")
 STARTS_M = np.array([[0.0, 1.5, -1.2], [0.0, -1.5, -1.2]])
 BEGIN_NS, ZERO_UTC_NS = 70 * 10**9, 10**18
-CYCLES, HELD = 40, 30
+CYCLES = 40
 
 
 def record_cycles(recording: CoordinatorRecording, cycles: int = CYCLES) -> int:
@@ -40,8 +40,6 @@ def record_cycles(recording: CoordinatorRecording, cycles: int = CYCLES) -> int:
     for cycle in range(cycles):
         at_ns = BEGIN_NS + cycle * CYCLE_NS
         step = at_ns // dt_ns
-        if cycle == HELD:
-            coordinator.hold()
         for number, start_m in enumerate(STARTS_M):
             velocity_mps = np.array([0.0, -0.3 * np.sign(start_m[1]), 0.0])
             place_m = start_m + 0.1 * cycle * velocity_mps + rng.normal(0.0, 0.01, 3)
