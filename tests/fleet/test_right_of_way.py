@@ -4,8 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from uavctl.fleet.right_of_way import LOOK_AHEAD_M, PASS_M, Move, Ways, choose_guides, choose_move
+from uavctl.arrays import Array
+from uavctl.fleet.boxes import ROUNDING_M
+from uavctl.fleet.right_of_way import LOOK_AHEAD_M, PASS_M, Move, Ways, choose_guides, choose_move, separate_goals
 
 Node = tuple[int, int]
 TURNS: tuple[Node, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # north, east, south, west: quarter turns to the right
@@ -104,3 +108,33 @@ def test_a_vehicle_at_its_goal_gives_way_to_one_that_could_only_go_back() -> Non
     positions_m = np.array([[-0.5, 0.0, -1.0], [0.5, 0.0, -1.0]])
     guides_m = choose_guides(positions_m, np.array([[2.0, 0.0, -1.0], [0.5, 0.0, -1.0]]), walls)
     np.testing.assert_allclose(guides_m, [[-0.5, 0.0, -1.0], [0.5 + PASS_M, 0.0, -1.0]], atol=1e-12)
+
+
+WIDE_M, PITCH_M = 3.0, 1.1
+SMALL_ROOM = Ways(0.5, 0.1, np.full(3, -WIDE_M), np.full(3, WIDE_M))
+PLACES = st.lists(st.tuples(*[st.integers(-9, 9)] * 4), min_size=1, max_size=8)
+
+
+def measure_apart_m(places_m: Array) -> Array:
+    """Distances of all pairs (N, N), north or east; infinite to itself."""
+    offsets_m = np.abs(places_m[:, None, :2] - places_m[None, :, :2]).max(axis=2)
+    return np.asarray(offsets_m + np.diag(np.full(len(places_m), np.inf)))
+
+
+@given(PLACES)
+def test_of_several_with_one_goal_the_nearest_keeps_it_and_the_others_get_places_apart(
+    rows: list[tuple[int, int, int, int]],
+) -> None:
+    table = np.array(rows) * 0.3
+    flat = np.zeros((len(rows), 1))
+    positions_m, goals_m = np.hstack([table[:, :2], flat]), np.hstack([table[:, 2:], flat])
+    separated_m = separate_goals(goals_m, positions_m, SMALL_ROOM, PITCH_M)
+    is_kept = (separated_m == goals_m).all(axis=1)
+    is_apart = measure_apart_m(goals_m).min(axis=1) >= SMALL_ROOM.width_m - ROUNDING_M
+    assert is_kept[np.linalg.norm(goals_m - positions_m, axis=1).argmin()]
+    assert (np.abs(separated_m) <= WIDE_M).all()
+    stays = (separated_m == positions_m).all(axis=1)
+    moved = ~stays & ~is_kept
+    assert (measure_apart_m(separated_m)[moved][:, is_kept | moved] >= SMALL_ROOM.width_m - ROUNDING_M).all()
+    if is_apart.all():
+        assert is_kept.all()

@@ -1,7 +1,9 @@
 """Vehicles in one world with their own control loops in moving cells, judged by their true positions."""
 
 import dataclasses
+import math
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -84,6 +86,25 @@ def test_a_vehicle_that_lands_in_flight_first_rests_in_its_cell_and_lands_no_oth
     positions_m = swap.positions_m
     assert (np.linalg.norm(positions_m - swap.goals_m, axis=1)[len(landing) :] < NEAR_M).all()
     assert (positions_m[: len(landing), 2] > -0.2).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_of_three_with_one_goal_one_arrives_and_the_others_wait_beside_it(
+    autopilot: Literal["px4", "ardupilot"], tmp_path: Path
+) -> None:
+    """Each had given way to the others for good, and none arrived."""
+    begins_m, goals_m = make_circle(3)
+    goals_m[:] = [0.3, -0.2, -1.2]
+    swap = Swap(SwapCase(3, 15, autopilot, limit_s=20.0), begins_m, goals_m, tmp_path)
+    result = swap.fly()
+    distances_m = np.sort(np.linalg.norm(swap.positions_m - goals_m, axis=1))
+    assert distances_m[0] < NEAR_M
+    # Corner of a square with the room of two cells: 2^½ (d + 2 · 0.3 m)
+    assert distances_m[2] < math.sqrt(2.0) * 1.1 + NEAR_M
+    assert result.collisions == 0
+    assert result.closest >= 1.0
+    assert result.landings == 0
 
 
 @pytest.mark.long

@@ -29,7 +29,7 @@ from uavctl.fleet.boxes import LEVEL, ROUNDING_M, Bounds, Boxes, divide_pairs, f
 from uavctl.fleet.cell import NO_CELL, MovingCell, PlannedPath, Report
 from uavctl.fleet.obstacles import find_reach
 from uavctl.fleet.priority import Progress, choose_places, follow_progress, make_grid
-from uavctl.fleet.right_of_way import ARRIVED_M, Ways, choose_guides
+from uavctl.fleet.right_of_way import ARRIVED_M, Ways, choose_guides, separate_goals
 from uavctl.records import Conduct
 
 START_NUMBER = 0  # number of the cell in which a vehicle begins
@@ -318,13 +318,14 @@ def lead(
         step: Step now.
         parameters: Constants of the cells.
     """
+    room = parameters.room_lower_m, parameters.room_upper_m
+    ways = Ways(parameters.distance_m, parameters.margin_m, *room)
+    pitch_m = parameters.distance_m + 2.0 * (parameters.margin_m + parameters.max_margin_m)
+    goals_m = separate_goals(goals_m, positions_m, ways, pitch_m)
     level_m, level_goals_m = positions_m[:, :2], goals_m[:, :2]
     progress = follow_progress(known, level_m, level_goals_m, is_led, step, parameters.dt_s, ARRIVED_M)
-    room = parameters.room_lower_m, parameters.room_upper_m
     if not any(one.is_stuck for one in progress):
-        ways = Ways(parameters.distance_m, parameters.margin_m, *room)
         return choose_guides(positions_m, goals_m, ways), progress
-    pitch_m = parameters.distance_m + 2.0 * (parameters.margin_m + parameters.max_margin_m)
     waits = step - np.array([one.step for one in progress])
     guides_m = goals_m.copy()
     guides_m[:, :2] = choose_places(level_m, level_goals_m, waits, is_led, make_grid(*room, pitch_m))

@@ -6,6 +6,7 @@
    else back.
 4. A vehicle at its goal, or on its way back there, gives way to one that can pass on neither side. Else that one goes
    back and ahead for good.
+5. Of several with one goal the nearest gets it. The others go to places beside it.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ def choose_move(is_free: dict[Move, bool], has_right_of_way: bool) -> Move:
 
 LOOK_AHEAD_M = 1.6  # way on which a vehicle looks for others: about that of a stop from 1.5 m/s, twice
 PASS_M = 1.2  # way of a move to a side
+# Corners of a square, and middles of its sides
+_SQUARE = np.array([(north, east) for north in (-1.0, 0.0, 1.0) for east in (-1.0, 0.0, 1.0) if north or east])
 ARRIVED_M = 0.15  # a vehicle that is this near to its goal rests
 
 
@@ -57,6 +60,42 @@ class Ways:
     def width_m(self) -> float:
         """Sideways distance within which another vehicle blocks the way."""
         return self.distance_m + 2.0 * self.margin_m
+
+
+def separate_goals(goals_m: Array, positions_m: Array, ways: Ways, pitch_m: float) -> Array:
+    """Separate goals that are too near for cells at both (N, 3): the vehicle that is nearest to its goal keeps it.
+
+    Each other one gets the nearest place of a square around the goals that are kept, or stays where it is.
+
+    Args:
+        goals_m: (N, 3).
+        positions_m: (N, 3).
+        pitch_m: Half side of the square, by which places for two are apart.
+    """
+    apart_m = goals_m.copy()
+    offsets_m = np.abs(goals_m[:, None] - goals_m[None])[..., LEVEL].max(axis=2)
+    np.fill_diagonal(offsets_m, np.inf)
+    if offsets_m.min() >= ways.width_m - ROUNDING_M:
+        return apart_m
+    level_m, begin_m = apart_m[:, LEVEL], positions_m[:, LEVEL]
+    kept = np.zeros((0, 2))
+    for i in np.argsort(np.linalg.norm(goals_m - positions_m, axis=1), kind="stable"):
+        if _find_nearest_m(level_m[i : i + 1], kept)[0] < ways.width_m - ROUNDING_M:
+            # The place of the square towards the vehicle, its corners and the middles of its sides
+            way_m = begin_m[i] - kept
+            towards = way_m / np.maximum(np.abs(way_m).max(axis=1, keepdims=True), ROUNDING_M)
+            places_m = np.vstack([kept + pitch_m * towards, (kept[:, None] + pitch_m * _SQUARE).reshape(-1, 2)])
+            is_inside = ((places_m > ways.room_lower_m[LEVEL]) & (places_m < ways.room_upper_m[LEVEL])).all(axis=1)
+            places_m = places_m[is_inside & (_find_nearest_m(places_m, kept) >= pitch_m - ROUNDING_M)]
+            places_m = np.vstack([places_m, begin_m[i : i + 1]])[: max(len(places_m), 1)]
+            level_m[i] = places_m[np.linalg.norm(places_m - begin_m[i], axis=1).argmin()]
+        kept = np.vstack([kept, level_m[i]])
+    return apart_m
+
+
+def _find_nearest_m(places_m: Array, others_m: Array) -> Array:
+    """Find the distance, north or east, from each place (M, 2) to the nearest other one (K, 2): (M,)."""
+    return np.asarray(np.abs(places_m[:, None] - others_m[None]).max(axis=2).min(axis=1, initial=np.inf))
 
 
 def choose_guides(positions_m: Array, goals_m: Array, ways: Ways) -> Array:
